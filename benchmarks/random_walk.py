@@ -88,7 +88,7 @@ def many_arms(chart: oc.Chart, arms: int, times: int) -> tuple[int, int, float, 
 def main(quick: bool = False) -> dict[str, float]:
     """Print a table, and return its numbers."""
     chart, found = oc.charts.load("panda-wide"), {}
-    steps, arms, times = (2_000, 50, 4) if quick else (STEPS, ARMS, TIMES)
+    steps, arms, times = (1_000, 50, 2) if quick else (STEPS, ARMS, TIMES)
     cases = {"one arm": (steps, lambda: one_arm(chart, steps))}
     if importlib.util.find_spec("jax") is not None:
         cases["many arms, JAX"] = arms * times, lambda: many_arms(chart, arms, times)

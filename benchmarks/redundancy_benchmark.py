@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 from redundancy import tuning
-from redundancy.arms import SOURCES
+from redundancy.arms import HELD_OUT, SOURCES
 from redundancy.runner import measured, scenarios
 
 QUICK = ("drift", "elbow", "base")
@@ -31,7 +31,7 @@ def main(
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("names", nargs="*", metavar="SCENARIO", help=f"default: all of {', '.join(scenarios())}")
-    parser.add_argument("--arms", nargs="+", default=list(SOURCES), choices=list(SOURCES))
+    parser.add_argument("--arms", nargs="+", default=list(SOURCES), choices=[*SOURCES, *HELD_OUT])
     parser.add_argument("--seeds", nargs="+", type=int, default=[0, 1])
     parser.add_argument("--method", type=Path, action="append", default=[], help="a file with METHODS of your own")
     parser.add_argument("--quick", action="store_true", help="one arm, short runs; prints, and keeps nothing")

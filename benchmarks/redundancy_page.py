@@ -34,6 +34,13 @@ OVERVIEW = {  # methods in the paper's table, and their names there
     "SEW angle": "SEW angle",
     "ssik": "ssik",
 }
+HELD_OUT = {  # methods that ran on the arms that are held out, and their names in that table
+    "arm": "whole arm",
+    "chart, wide": "wide chart",
+    "pink, posture 1e-3": "pink",
+    "mink, posture 1e-3": "mink",
+    "placo, posture 1e-6": "placo",
+}
 
 
 @dataclass(frozen=True)
@@ -129,13 +136,13 @@ def _middle(row: Row, scenario: Scenario) -> float:
     return float((np.mean if scenario.percent else np.median)(row.values))
 
 
-def overview(found: Mapping[str, Mapping[str, Any]]) -> list[str]:
+def overview(found: Mapping[str, Mapping[str, Any]], columns: Mapping[str, str] = OVERVIEW) -> list[str]:
     """A row for each scenario in Markdown: numbers as in its table, and how many cases were served if not all."""
-    lines = ["| " + " | ".join(["number", *OVERVIEW.values()]) + " |"]
+    lines = ["| " + " | ".join(["number", *columns.values()]) + " |"]
     for name, result in found.items():
         scenario = scenarios()[name]
         rows = {row.method: row for row in rows_of(result, result["seeds"])}
-        numbers = [short(rows[method], scenario) if rows[method].cases else "-" for method in OVERVIEW]
+        numbers = [short(rows[method], scenario) if rows[method].cases else "-" for method in columns]
         lines.append(f"| {' | '.join([scenario.number, *numbers])} |")
     return lines
 
@@ -204,11 +211,14 @@ def changes(found: Mapping[str, Mapping[str, Any]]) -> list[tuple[str, str, str]
 def main() -> None:
     """Renew tables, pictures, the record, and the table of the paper."""
     page, known = PAGE.read_text(), scenarios()
-    found = {
-        name: json.loads((RESULTS / f"{name}.json").read_text())
-        for name in known
-        if (RESULTS / f"{name}.json").exists()
-    }
+    found, apart = (
+        {
+            name: json.loads((folder / f"{name}.json").read_text())
+            for name in known
+            if (folder / f"{name}.json").exists()
+        }
+        for folder in (RESULTS, RESULTS / "held_out")
+    )
     record = json.loads(RECORD.read_text()) if RECORD.exists() else {"printed": []}
     record |= {"source": "measured", "command": "python benchmarks/redundancy_benchmark.py", "tables": []}
     record["results"] = str(RESULTS.relative_to(ROOT))
@@ -220,6 +230,13 @@ def main() -> None:
             rf"(<!-- {name} -->\n).*?(<!-- end -->)", lambda m, text=text: f"{m[1]}\n{text}\n\n{m[2]}", page, flags=re.S
         )
         picture(known[name], result).savefig(FIGURES / f"redundancy_{name}.png", dpi=110, transparent=True)
+    # Arms that are held out, in one table.
+    lines = overview(apart, HELD_OUT)
+    record["tables"].append(lines)
+    text = "\n".join([lines[0], "| --- " * lines[0].count(" | ") + "| --- |", *lines[1:]])
+    page = re.sub(
+        r"(<!-- held out -->\n).*?(<!-- end -->)", lambda m, text=text: f"{m[1]}\n{text}\n\n{m[2]}", page, flags=re.S
+    )
     lines = overview(found)
     record["tables"].append(lines)
     rule = "| :" + "- | :".join(["-" * 34, *["-" * 10] * len(OVERVIEW)]) + "- |"  # pandoc takes widths from it

@@ -9,12 +9,15 @@ os.environ.pop("PYTHONDONTWRITEBYTECODE", None)  # or every Python that tests st
 
 import gc
 import json
+import pickle
 import signal
 import sys
 import threading
 from dataclasses import replace
 from importlib import metadata
 from pathlib import Path
+from typing import Any
+from unittest.mock import patch
 
 import numpy as np
 import pinocchio as pin
@@ -29,19 +32,45 @@ from simulate_command import SHORT
 import orthocas as oc
 from orthocas import problems
 from orthocas.arms import kernel as arm_kernel
-from orthocas.charts import quality
+from orthocas.charts import motion_kernel, point_quality, quality
 from orthocas.cli import simulate
 from orthocas.cli.entry import main
 from orthocas.codegen import CompiledLibrary, GeneratedC, Supervisor, compile_shared, compiled, compiled_inverse
 from orthocas.codegen.library import STRICT
-from orthocas.control import PDPlus, Reference
+from orthocas.control import PDPlus, Reference, gains, operational_space
 from orthocas.fitting.fit import Fit
 from orthocas.robots import pinocchio_model, urdf
+from orthocas.tasks import branches
 from orthocas.tools.checks import Array
 
 compile_shared.__defaults__ = (("-O0",), None)  # users' -O2 takes gcc three times as long, and computes the same
 compiled._FLAGS, compiled_inverse._FLAGS = ("-O1",), (*STRICT, "-O1")  # as their -O2 and -O3; here it runs for longer
 arm_kernel._FLAGS = (*STRICT, "-O2")
+motion_kernel._FLAGS = (*STRICT, "-O1")
+
+
+def _search_briefly(value: point_quality.Value, domain: oc.Domain, seed: int = 0) -> Array:
+    """As users' search for the fastest and slowest mode of a law, from a sixth of the candidates."""
+    fewer = replace(point_quality.WORST, candidates=1000, descents=50, kept=10)
+    with patch.object(point_quality, "WORST", fewer):
+        return point_quality.least_in_domain(value, domain, seed)
+
+
+operational_space.least_in_domain = gains.least_in_domain = _search_briefly  # type: ignore[attr-defined]
+
+_find_cuts = branches._Arm.find_cuts
+_CUTS: dict[Any, list[branches.Cut]] = {}
+
+
+def _remember_cuts(arm: branches._Arm, k: int) -> list[branches.Cut]:
+    """The cuts of a joint, found once for robots of the same content: many tests fit the same arms."""
+    key = pickle.dumps((arm.robot, arm.task.recipe, arm.joints, k)), branches._Arm._measure_slice
+    if key not in _CUTS:
+        _CUTS[key] = _find_cuts(arm, k)
+    return list(_CUTS[key])
+
+
+branches._Arm.find_cuts = _remember_cuts  # type: ignore[method-assign]
 sys.dont_write_bytecode = False  # for the test files, which come after this one
 quality.RULES = replace(
     quality.RULES, samples=20_000

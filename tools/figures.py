@@ -16,6 +16,7 @@ take values. Numbers that nobody measured (settings, limits, versions) are the p
 """
 
 import argparse
+import ast
 import contextlib
 import importlib
 import importlib.util
@@ -25,6 +26,7 @@ import json
 import re
 import resource
 import shlex
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -391,17 +393,31 @@ def main(names: Sequence[str], keep: bool) -> int:
 
 
 def find_missing(record: Record) -> str:
-    """What the script of a record imports that is not here, and how to get it; "" if nothing is missing."""
+    """What the script of a record needs that is not here, and how to get it; "" if nothing is missing."""
     if not (record.script and (ROOT / record.script).exists()):
         return ""
-    folder = (ROOT / record.script).parent
-    imports = re.findall(r"^ *(?:import|from) (\w+)", (ROOT / record.script).read_text(), re.MULTILINE)
-    for name in dict.fromkeys(imports):
+    folder, text = (ROOT / record.script).parent, (ROOT / record.script).read_text()
+    # Programs by their names as words of a command, packages also where they are loaded late, by name.
+    for program in dict.fromkeys(re.findall(r'"(cmake|arm-none-eabi-gcc|qemu-system-arm)"', text)):
+        if shutil.which(program) is None:
+            return f"it needs the program {program}"
+    for name in dict.fromkeys(_list_imports(text)):
         if name == "browser" and imported("benchmarks/browser.py").PROGRAM is None:
             return "it needs the browser chromium (apt install chromium)"
         if not (folder / f"{name}.py").exists() and importlib.util.find_spec(name) is None:
-            return f"it needs the package {name} (pip install -e '.[bench]')"
+            return f"it needs the package {name} (pip install -e '.[bench,peers,dask]')"
     return ""
+
+
+def _list_imports(text: str) -> Iterator[str]:
+    """Packages of all import statements of a script, and of `import_module("...")`."""
+    for node in ast.walk(ast.parse(text)):
+        if isinstance(node, ast.Import):
+            yield from (alias.name.partition(".")[0] for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            yield node.module.partition(".")[0]
+        elif isinstance(node, ast.Call) and ast.unparse(node.func).endswith("import_module") and node.args:
+            yield from re.findall(r"^'(\w+)", ast.unparse(node.args[0]))
 
 
 if __name__ == "__main__":

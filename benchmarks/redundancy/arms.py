@@ -52,14 +52,18 @@ SOURCES = {
     "pr2": Source("pr2_description/urdf/pr2.urdf", "l_gripper_tool_frame", "l_shoulder_pan_joint"),
     "g1": Source("g1_description/urdf/g1_29dof_rev_1_0.urdf", "left_wrist_yaw_link", "left_shoulder_pitch_joint"),
 }
-TUNED_ON = ("iiwa", "panda")  #: the other six never see the tuning
+TUNED_ON = ("iiwa", "panda")  #: the other six never see the tuning of settings
+HELD_OUT = {
+    "talos": Source("talos_data/robots/talos_reduced.urdf", "gripper_left_base_link", "arm_left_1_joint"),
+    "romeo": Source("romeo_description/urdf/romeo.urdf", "l_wrist", "LShoulderPitch"),
+}  #: arms on which no method was looked at while it was written
 
 
 class Arm:
     """A chain in Pinocchio and in orthocas, a posture to begin at, and the angle of its elbow.
 
     Args:
-        name: of `SOURCES`.
+        name: of `SOURCES` or `HELD_OUT`.
         mobile: with a base that moves in the plane and turns, three joints more.
     """
 
@@ -78,8 +82,9 @@ class Arm:
         """The maker's, or a posture in the middle of the joint range, bent if that is singular; a base is at 0."""
         if self.mobile:
             return np.concatenate([np.zeros(3), Arm(self.name).home])
-        if SOURCES[self.name].home:
-            return np.array(SOURCES[self.name].home)
+        home = {**SOURCES, **HELD_OUT}[self.name].home
+        if home:
+            return np.array(home)
         return np.array(regular_box(self.robot, oc.Task.pose(self.robot)).centre)
 
     @cached_property
@@ -177,7 +182,7 @@ def chain(name: str, mobile: bool = False) -> str:
 
     Joints without an end get limits of half a turn to both sides, so that all methods see the same range.
     """
-    source = SOURCES[name]
+    source = {**SOURCES, **HELD_OUT}[name]
     model, frame = _reduced(source)
     first = model.getJointId(source.first)
     order = [first]

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 import orthocas as oc
-from redundancy.arms import SOURCES, TICK, Arm
+from redundancy.arms import HELD_OUT, SOURCES, TICK, Arm
 from redundancy.protocol import Method, Run, Scenario, Stream, Unsuited
 
 FOLDER = Path(__file__).parent
@@ -195,7 +195,11 @@ def measured(
     processes: int = 2,
     only: Sequence[str] = (),
 ) -> dict[str, dict[str, Any]]:
-    """The content of the results' files, by scenario. What other methods, arms and seeds have there is kept."""
+    """The content of the results' files, by scenario. What other methods, arms and seeds have there is kept.
+
+    Arms that are held out have a folder of their own.
+    """
+    apart = "held_out" if set(arms) <= set(HELD_OUT) else ""
     tasks = [(name, mobile, names, seeds, more, quick, only) for mobile in (False, True) for name in arms]
     known, cases, content = scenarios(), [], {}
     for found in _in_processes(tasks, processes):
@@ -205,7 +209,7 @@ def measured(
             for name in names
         }
         if not quick:
-            save(content)  # what is there so far
+            save(content, apart)  # what is there so far
     return content
 
 
@@ -238,11 +242,12 @@ def _file(
     }
 
 
-def save(found: Mapping[str, Mapping[str, Any]]) -> None:
-    """One file for each scenario, with what others have measured there before."""
-    RESULTS.mkdir(exist_ok=True)
+def save(found: Mapping[str, Mapping[str, Any]], apart: str = "") -> None:
+    """One file for each scenario, with what others have measured there before; of some arms, in a folder of its own."""
+    folder = RESULTS / apart
+    folder.mkdir(parents=True, exist_ok=True)
     for name, content in found.items():
-        path = RESULTS / f"{name}.json"
+        path = folder / f"{name}.json"
         before = json.loads(path.read_text()) if path.exists() else {}
         path.write_text(json.dumps(_join(before, content), indent=1) + "\n")
 
@@ -251,7 +256,7 @@ def _join(before: Mapping[str, Any], now: Mapping[str, Any]) -> dict[str, Any]:
     """Results with those of before: of other methods, and of other arms and seeds of the same settings."""
     if before.get("schema") != now["schema"]:
         return dict(now)
-    arms = [name for name in SOURCES if name in {*before["arms"], *now["arms"]}]
+    arms = [name for name in (*SOURCES, *HELD_OUT) if name in {*before["arms"], *now["arms"]}]
     rows = dict(before["methods"])
     for name, row in now["methods"].items():
         done = {(case["arm"], case["seed"]) for case in row["cases"]}

@@ -55,6 +55,7 @@ from orthocas.control.linear_algebra import (
 from orthocas.control.memory import MEMORIES, Memory, Remembers
 from orthocas.control.run_time_model import UNITS, Gravity, RunTimeModel, Source
 from orthocas.errors import InvalidValueError, LawWarning
+from orthocas.robots.robot import Robot
 from orthocas.robots.tree import require_driven
 from orthocas.tasks.metric import Metric
 from orthocas.tasks.samples import sample_uniform
@@ -463,12 +464,17 @@ class _OperationalSpace(LawOfChart):
             ShapeError, InvalidValueError: if q has another shape, or is not finite.
         """
         if q is None:
-            fastest = find_fastest_posture(self.chart, self.stiffness, self.model.robot(self.problem))
+            fastest = find_fastest_posture(self.chart, self.stiffness, self._robot)
             q = np.vstack([sample_uniform(self.problem.domain, RULES.samples, 0), fastest])
         points, single = as_point_set("q", q, self.chart.n)
-        W = compute_mobility(self.chart, points, self.model.robot(self.problem))
+        W = compute_mobility(self.chart, points, self._robot)
         result = compute_modes(W, self.compute_stiffness(points), self._compute_damping(points))
         return Modes(*(values[0] for values in vars(result).values())) if single else result
+
+    @cached_property
+    def _robot(self) -> Robot:
+        """The robot with the default payload: one object, whose functions are built once."""
+        return self.model.robot(self.problem)
 
     @cached_property
     def integral_bound(self) -> float:
@@ -492,7 +498,7 @@ class _OperationalSpace(LawOfChart):
         """K(q) at points (N, n), (N, n, n): the diagonal of the stiffness, or what inertia and joints leave of it."""
         if not self.is_limited:
             return np.tile(np.diag(self.stiffness), (len(points), 1, 1))
-        W = compute_mobility(self.chart, points, self.model.robot(self.problem))
+        W = compute_mobility(self.chart, points, self._robot)
         J = self.chart.parts.batched_rates(points)
         return limit_stiffness(W, J, self.stiffness, self.fastest, self.compliance, self._blocks)
 

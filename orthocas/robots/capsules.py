@@ -226,6 +226,7 @@ def _cover(
     low, high = low.min(axis=0), high.max(axis=0)
     points = np.random.default_rng(RULES.seed).uniform(low, high, (RULES.few, 3))
     each = float(np.prod(high - low)) / RULES.few
+    # Covers of two kinds of cuts: of the smallest union of all capsules, and of the smallest sum of the two new ones.
     for overlaps in (True, False):
         pieces, held = list(first), [capsule.contains(points) for _, capsule in first]
         whole = each * np.any(held, axis=0).sum()

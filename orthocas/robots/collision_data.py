@@ -76,6 +76,7 @@ _SIZES = {"box": 3, "ball": 1, "cylinder": 2, "capsule": 2, "ellipsoid": 3, "hal
 
 def collisions_to_data(collisions: Collisions) -> tuple[dict[str, Any], dict[str, Array]]:
     """A collision model as plain data and arrays; of solids that a pair needs. Corners have single precision."""
+    # Solids that no pair names are never measured, so files need not carry them.
     used = {name for pair in collisions.pairs for name in pair}
     parts, poses, sizes, points = list[dict[str, Any]](), list[Array](), list[float](), list[Array]()
     for part in collisions.parts:
@@ -88,6 +89,7 @@ def collisions_to_data(collisions: Collisions) -> tuple[dict[str, Any], dict[str
         poses.append(np.column_stack([part.shape.rotation, part.shape.translation]))
         sizes += [float(value) for value in numbers]
         points.append(corners)
+    # Pairs as numbers of names: several parts of a link share its name.
     names = list(dict.fromkeys(part["name"] for part in parts))
     header = {
         "parts": parts,
@@ -95,6 +97,7 @@ def collisions_to_data(collisions: Collisions) -> tuple[dict[str, Any], dict[str
         "missing": list(collisions.missing),
         "origin": collisions.origin,
     }
+    # Corners are most of the bytes; a float32 of a metre is off by less than a tenth of a micrometre.
     corners = np.concatenate([np.zeros((0, 3)), *points]).astype(np.float32)
     arrays = (np.array(poses).reshape(-1, 3, 4), np.array(sizes, dtype=float), corners)
     return header, dict(zip(_ARRAYS, arrays, strict=True))
@@ -107,6 +110,7 @@ def collisions_from_data(tree: KinematicTree, data: Mapping[str, Any], arrays: M
         OrthocasError, and the errors that Python and NumPy have for damaged data: if they make no sense.
     """
     poses, sizes, points = (np.asarray(get_part(arrays, name, np.ndarray), dtype=float) for name in _ARRAYS)
+    # Nothing is trusted: a file may have been edited.
     for name, array in zip(_ARRAYS, (poses, sizes, points), strict=True):
         if not (np.abs(array) <= RULES.largest).all():
             raise InvalidValueError(name, "numbers that are not finite or too large", f"at most {RULES.largest:g}")
@@ -122,6 +126,7 @@ def collisions_from_data(tree: KinematicTree, data: Mapping[str, Any], arrays: M
         if count < 0 or len(own) != _SIZES[kind] or len(corners) != count:
             raise InvalidValueError("solids", f"fewer numbers than a {kind} has", "as many")
         size, point = size + len(own), point + count
+        # A scaled or mirrored pose would change distances without a word.
         R = pose[:, :3]
         if np.abs(R.T @ R - np.eye(3)).max() > RULES.straight:
             raise InvalidValueError("collisions_poses", R.tolist(), "rotations")

@@ -235,6 +235,7 @@ def _find_neighbours(root: ElementTree.Element, solid: set[str]) -> set[frozense
         parent, child = joint.find("parent"), joint.find("child")
         if parent is not None and child is not None:
             parents[child.get("link", "")] = parent.get("link", "")
+    # From each solid upwards, past frames and empty links, to the next solid.
     neighbours = set()
     for link in solid:
         above = parents.get(link)
@@ -253,6 +254,7 @@ def _read_shape(path: Path, element: ElementTree.Element) -> Shape | None:
         return None
     pose = read_pose(element)
 
+    # A missing size reads as 0, and is refused like one.
     def sizes(*names: str, count: int = 1) -> list[Array]:
         values = [read_numbers(shape, name, count, (0.0,) * count) for name in names]
         if min(float(value.min()) for value in values) < RULES.smallest:
@@ -268,6 +270,7 @@ def _read_shape(path: Path, element: ElementTree.Element) -> Shape | None:
         case "cylinder" | "capsule":
             radius, length = (float(value[0]) for value in sizes("radius", "length"))
             solid = (CylinderGeometry if shape.tag == "cylinder" else CapsuleGeometry)(radius, length)
+        # A flat or empty mesh encloses nothing that could touch.
         case "mesh":
             try:
                 solid = HullGeometry.around(load_mesh(path, shape)[0])

@@ -153,6 +153,7 @@ class Collisions(Shown):
         self.missing = tuple(missing)  #: names of links with a mesh that cannot be found or read
         self.origin = require_text("origin", origin)
         self.pairs = _check_pairs("pairs", pairs, [part.name for part in parts])  #: checked pairs, by names
+        # coal measures no distance between an ellipsoid and a cloud.
         shut = {part.name for part in parts if not part.shape.geometry.knows_clouds}
         clouds = {part.name for part in parts if part.shape.geometry.reported_first}
         for pair in self.pairs if shut and clouds else ():
@@ -196,6 +197,7 @@ class Collisions(Shown):
         scratch = self._scratch
         for row, position in zip(values, points, strict=True):
             scratch.place(position)
+            # Of all parts of a pair, the least distance; bounds save nothing where every distance is asked for.
             for k, owner in enumerate(self._owners.tolist()):
                 found = pin.computeDistance(scratch.geometry, scratch.placed, k).min_distance
                 row[owner] = min(row[owner], found)
@@ -206,6 +208,7 @@ class Collisions(Shown):
         points, single = as_point_set("q", q, self.tree.n)
         free = np.ones(len(points), dtype=bool)
         scratch = self._scratch
+        # Postures whose lower bounds are all above zero are free without a call of coal; of others, likely pairs first.
         for start in range(0, len(points), RULES.piece):
             some = points[start : start + RULES.piece]
             bounds = self._bound_distances(some, 0.0)
@@ -267,8 +270,10 @@ class Collisions(Shown):
         extra = self.rates @ np.broadcast_to(away, (self.tree.n,))
         if not self._owners.size or not len(points):
             return None
+        # Longer ways would be halved too often.
         if np.abs(np.diff(points, axis=0)).max(initial=0.0) > RULES.longest:
             raise InvalidValueError("q", "two postures farther apart", f"ways of at most {RULES.longest:g} rad or m")
+        # Balls around the parts first, over many ways at once; a single posture is a way without a move.
         for start in range(0, max(len(points) - 1, 1), RULES.piece):
             some = points[start : start + RULES.piece + 1]
             later = slice(1, None) if len(some) > 1 else slice(None)
@@ -279,6 +284,7 @@ class Collisions(Shown):
             def find_room(bounds: Array = bounds, loss: Array = loss, later: slice = later) -> Array:
                 return np.asarray((bounds[: len(loss)] + bounds[later]) / 2 - loss)
 
+            # Capsules at both ends of ways where balls leave no room; what still lacks it is halved.
             rows, pairs = np.nonzero(find_room() <= gap)
             near = np.zeros(bounds.shape, dtype=bool)
             near[rows, pairs] = near[np.minimum(rows + 1, len(some) - 1), pairs] = True
@@ -334,6 +340,7 @@ class Collisions(Shown):
 
     def _add(self, parts: Sequence[Part], allowed: Sequence[Pair]) -> Collisions:
         """The same with further parts, checked against all that are there and of another body."""
+        # Old against old is checked already, and parts of one body never move against each other.
         bodies = {part.name: part.body for part in self.parts}
         both = [*bodies, *(part.name for part in parts)]
         touching = {frozenset(pair) for pair in _check_pairs("allowed", allowed, both)}
@@ -377,6 +384,7 @@ class Collisions(Shown):
         k = min(count, most)
         if not k or not N:
             return np.zeros((N, 0)), np.zeros((N, 0, self.tree.n))
+        # Ball bounds for all pairs, capsule bounds for the first of them, coal for the k nearest of these.
         bounds, capsules = self._bound_by_balls(points)
         first = min(RULES.first, most)
         chosen = np.argpartition(bounds, first - 1, axis=1)[:, :first]
@@ -516,6 +524,7 @@ class Collisions(Shown):
         for row, order, own in zip(rows.tolist(), orders.tolist(), sorted_bounds, strict=True):
             scratch.place(points[row])
             least, nearest = values[row], -1
+            # Bounds ascend, so the first one above the least distance ends the search.
             for bound, k in zip(own, order, strict=True):
                 if bound >= least:
                     break
@@ -593,6 +602,7 @@ class Collisions(Shown):
         carriers: dict[str, list[int]] = {}
         for k, part in enumerate(self.parts):
             carriers.setdefault(part.name, []).append(k)
+        # A link of several parts has a row for each of them with each part of the other link.
         rows = [
             (i, k, owner)
             for owner, (first, second) in enumerate(self.pairs)

@@ -113,6 +113,7 @@ def _place_frame(tree: KinematicTree, q: ca.SX, frame: Frame, shared: list[int])
 def _build_jacobian(tree: KinematicTree, q: ca.SX, carrier: int, point: ca.SX, shared: list[int]) -> ca.SX:
     """Jacobian (6, n) of a point and of the frames of a body, by the joints between it and the shared bodies."""
     J, pose, positions = ca.SX(6, tree.bodies), (ca.SX.eye(3), ca.SX.zeros(3)), tree.expand(q)
+    # A sliding joint moves the point along its axis, a turning one across the arm to the point.
     for i in tree.carriers(carrier)[len(shared) :]:
         pose = _move_to_child(tree, positions, i, pose)
         axis = pose[0][:, 2]
@@ -323,6 +324,7 @@ def _read_tool(tool: ArrayLike) -> tuple[Array, Array]:
     values = as_float_array("tool", tool)
     require_finite("tool", values)
     numbers = values[:3, 3] if values.shape == (4, 4) else values.ravel()
+    # Millimetres and degrees are the usual mistakes; the error names them.
     if hint := units_hint(("m", "m", "m", "rad", "rad", "rad"), numbers.tolist()):
         raise InvalidValueError("tool", values.tolist(), f"the pose of a tip{hint}")
     if values.shape == (4, 4):

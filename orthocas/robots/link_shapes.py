@@ -89,6 +89,7 @@ def read_mesh(file: Path, scale: Array) -> tuple[Array, Indices]:
         mesh: Any = coal.MeshLoader().load(str(file), scale)
     except RuntimeError as error:
         raise ValueError(str(error)) from None
+    # coal's arrays belong to the mesh, and end with it.
     vertices = np.array(mesh.vertices(), dtype=float).reshape(-1, 3)
     faces = np.array([[t[0], t[1], t[2]] for t in map(mesh.tri_indices, range(mesh.num_tris))], dtype=np.intp)
     if not (len(faces) and np.isfinite(vertices).all()):

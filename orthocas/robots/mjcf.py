@@ -186,6 +186,7 @@ def _find_effort(mujoco: Any, compiled: Any, k: int) -> float:
     """The largest force [N] or torque [N m] of both signs at joint k; inf if an actuator has no limit, or none acts."""
     limit = _reach(compiled.jnt_actfrcrange[k]) if compiled.jnt_actfrclimited[k] else np.inf
     at_joint = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
+    # Motors behind tendons and sites have no torque of one joint alone.
     acting = [
         i for i in range(compiled.nu) if compiled.actuator_trntype[i] in at_joint and compiled.actuator_trnid[i, 0] == k
     ]
@@ -194,6 +195,7 @@ def _find_effort(mujoco: Any, compiled: Any, k: int) -> float:
         for i in acting
         if compiled.actuator_gear[i, 0]
     ]
+    # Motors of one joint add up, within the joint's own limit.
     return min(limit, sum(forces)) if forces and sum(forces) > 0 else limit
 
 

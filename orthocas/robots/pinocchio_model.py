@@ -187,6 +187,7 @@ def _find_limits(
     joint gets a turn from -pi to pi, where its next turns would bring a mimic joint elsewhere.
     """
     n = len(bodies) - len(follow)
+    # Own limits of all joints first, then the leaders are narrowed to what their mimics can follow.
     ends: tuple[list[float], list[float]] = ([], [])
     for i in bodies:
         joint = model.joints[i]
@@ -270,6 +271,7 @@ def lock_off_chain(model: pin.Model, *tips: str, mimics: Mimics | None = None) -
     follow = {name: mimic for name, mimic in (mimics or {}).items() if model.existJointName(name)}
     chains = [model.supports[model.frames[find_frame(model, tip)].parentJoint] for tip in tips]
     moving = {model.names[i] for supports in chains for i in supports if i > 0}
+    # A mimic joint on the way needs its leader, wherever that is, and the leader moves its other mimics too.
     for name in sorted(moving & follow.keys()):
         if not model.existJointName(leader := follow[name].leader):
             raise RobotError(f"joint '{name}' mimics joint '{leader}', which the file does not have")

@@ -167,9 +167,11 @@ class Robot(Shown):
     ) -> Self:
         """Build the joints that move the tips from a URDF file; see `from_file`."""
         file, names = as_path("path", path), _check_tips(tip, tips)
+        # A bare name such as panda is meant for from_name.
         if not file.suffix and not file.exists() and file.name in list_robot_files():
             raise RobotError(f"cannot read URDF file {file}: no such file; Robot.from_name('{file}') knows this name")
         robot = cls._from_chain(*read_urdf(file), names, locked, tool, base, gravity)
+        # Solids are read when they are asked for: meshes take longer than all else.
         source = CollisionSource(file.absolute(), None, dict(locked or {}))
         return cls(robot.tree, read_srdf_postures(file, robot.joint_names), source)
 
@@ -190,6 +192,7 @@ class Robot(Shown):
         Needs the extra `orthocas[mujoco]`, because MuJoCo's compiler reads the file.
         """
         robot = cls._from_chain(*read_mjcf(path, locked), _check_tips(tip, tips), locked, tool, base, gravity)
+        # A compiled model has no file to read solids from later.
         if not isinstance(path, str | PathLike):
             return robot
         source = CollisionSource(as_path("path", path).absolute(), None, dict(locked or {}))
@@ -208,6 +211,7 @@ class Robot(Shown):
     ) -> Self:
         """The robot of the joints that move the tips, without those that the user locks."""
         tips = tips or (find_default_tip(model),)
+        # First what the user locks, then all that moves no tip.
         chain = lock_off_chain(lock_joints(model, locked or {}, mimics), *tips, mimics=mimics)
         tree = build_tree(chain, *tips, base=base, mimics=mimics)
         robot = cls(tree, read_model_postures(chain, tree.joint_names))
@@ -418,6 +422,7 @@ class Robot(Shown):
         """Joints, limits, tip and mass. Limits of effort and velocity are left out if the file has none."""
         tree = self.tree
         tips = f"tip {tree.tip_name}" if not tree.tips else f"tips {listed(self.tips)}"
+        # Lines that would say nothing are left out.
         sliding = [name for name, slides in zip(tree.joint_names, tree.prismatic, strict=True) if slides]
         return {
             "robot": f"{self.n} joints, {tips}, {tree.masses.sum():.4g} kg",

@@ -307,6 +307,7 @@ def _check_tree(path: str | Path, root: ElementTree.Element) -> None:
     for i, name in enumerate(names):
         if not name or name in names[:i]:
             raise RobotError(f"{path}: two links are called '{name}'" if name else f"{path}: a link has no name")
+    # Names before anything else: every message below speaks of links and joints by name.
     joints = []
     for joint in root.findall("joint"):
         ends = (joint.find(end) for end in ("parent", "child"))
@@ -328,6 +329,7 @@ def _check_tree(path: str | Path, root: ElementTree.Element) -> None:
             )
         carriers[child] = name
         children.setdefault(parent, []).append(child)
+    # Parsers would take one of several roots, and drop the other trees without a word.
     roots = [link for link in names if link not in carriers]
     if len(roots) > 1:
         raise RobotError(f"{path}: the links '{roots[0]}' and '{roots[1]}' hang on no joint, expected one such link")
@@ -338,6 +340,7 @@ def _check_loops(
     path: str | Path, joints: Sequence[tuple[str, str, str]], children: Mapping[str, list[str]], roots: list[str]
 ) -> None:
     """Every joint (name, parent, child) can be reached from a root."""
+    # What no walk from the roots reaches hangs in a loop.
     reached, waiting = set(roots), list(roots)
     while waiting:
         new = [child for child in children.get(waiting.pop(), ()) if child not in reached]
@@ -384,6 +387,7 @@ def _read_mimics(model: pin.Model, root: ElementTree.Element) -> tuple[pin.Model
     Raises:
         RobotError: if joints follow each other in a loop.
     """
+    # pin reads mimic joints as free ones, so the file is asked.
     direct = {
         joint.get("name", ""): Mimic(
             mimic.get("joint", ""), float(mimic.get("multiplier", 1)), float(mimic.get("offset", 0))

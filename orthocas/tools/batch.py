@@ -169,6 +169,7 @@ def run_in_threads_with(
     tools: Sequence[Tool], work: Callable[[Tool, Piece], Result], pieces: Sequence[Piece]
 ) -> list[Result]:
     """`run_in_threads` with tools that one piece at a time can use; one for each thread, or each piece, is enough."""
+    # A CasADi function must not run twice at once: threads take one, and give it back.
     ready: SimpleQueue[Tool] = SimpleQueue()
     for tool in tools:
         ready.put(tool)

@@ -319,6 +319,7 @@ def read_table(
     Raises:
         PathFileError: names the file, the line, and what is wrong there.
     """
+    # The number of rows first: a file of another kind should say so, not complain of its first cell.
     lines = _read_lines(Path(path), what)
     if not least <= len(lines) - 1 <= most:
         came = f"it has {max(len(lines) - 1, 0)} {rows} after the header"

@@ -2,15 +2,17 @@
 
 import pickle
 import zipfile
-from functools import cache
+from functools import cache, partial
 from pathlib import Path
 
 import numpy as np
 import pinocchio as pin
 import pytest
+from programs import nightly
 
 import orthocas as oc
 from orthocas.arms import Postures
+from orthocas.arms import arm as arm_module
 from orthocas.charts.inverse import InverseStatus
 from orthocas.errors import ChartFileError, InvalidValueError, NotRedundantError, OrthocasError, UnknownNameError
 from orthocas.tools.checks import Array
@@ -38,6 +40,7 @@ def inside(arm: oc.Arm, count: int, seed: int) -> Array:
     return np.asarray(arm.charts[0].problem.domain.sample(count, seed))
 
 
+@pytest.mark.slow
 def test_forms_of_a_task_value_are_one() -> None:
     arm, q = panda(), inside(panda(), 1, 0)[0]
     p, R = arm.robot.tip_position(q), arm.robot.tip_rotation(q)
@@ -107,6 +110,7 @@ def test_without_a_start_the_posture_is_far_from_limits() -> None:
     assert (np.minimum(found.q - low, high - found.q) / (high - low)).min() >= room.max() - 1e-6
 
 
+@pytest.mark.slow
 def test_solutions_with_xi_are_those_of_newtons_method() -> None:
     """Newton's method on x and xi from 300 starts in the domain finds no other."""
     arm, chart = panda(), panda().charts[0]
@@ -157,7 +161,8 @@ def test_known_arms_load_by_name() -> None:
         oc.Arm.load("iwa")
 
 
-@pytest.mark.parametrize(("name", "branches"), [("panda", 4), ("iiwa7", 8), ("xarm7", 8), ("baxter-left", 4)])
+@pytest.mark.slow
+@pytest.mark.parametrize(("name", "branches"), [("panda", 4), ("iiwa7", 8), ("baxter-left", 4), *nightly(("xarm7", 8))])
 def test_ready_arms_have_charts_of_all_branches(name: str, branches: int) -> None:
     """Held-out postures of each domain: xi rises along the self-motion, and x and xi lead back to the branch."""
     arm = oc.Arm.load(name)
@@ -195,8 +200,10 @@ def test_damaged_arm_files_are_refused(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-def test_a_fit_has_a_chart_of_each_branch() -> None:
-    """A planar arm has one branch; the fit reports its progress under the branch's number."""
+def test_a_fit_has_a_chart_of_each_branch(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A planar arm has one branch; the fit reports its progress under the branch's number. Cubic, to be quick."""
+    cubic = partial(oc.fit_wide, parametrisation=oc.Polynomial(3), samples=1000)
+    monkeypatch.setattr(arm_module, "fit_wide", cubic)
     known, stages = oc.problems.get("planar_3r_xy"), set[str]()
 
     def watch(progress: Progress) -> None:
@@ -204,7 +211,7 @@ def test_a_fit_has_a_chart_of_each_branch() -> None:
 
     arm = oc.Arm.fit(known.robot, known.task, monitor=watch)
     assert (len(arm.charts), stages) == (1, {"branch 1 of 1"})
-    q = np.array([0.3, 0.9, 0.8])
+    q = arm.charts[0].domain.home
     assert arm.solve(arm.x(q), start=q).branch == arm.branch_names[0]
 
 
@@ -238,6 +245,7 @@ def test_an_arm_needs_one_joint_more_than_its_task() -> None:
         oc.Arm.fit(oc.problems.get("planar_3r_xy").robot, oc.Task.position(oc.problems.get("planar_3r_xy").robot, "x"))
 
 
+@pytest.mark.slow
 def test_full_turns_of_endless_joints_bring_postures_into_a_box() -> None:
     """Gen3's curves are traced on one sheet; a box about half a turn of its endless joints is met from both sides."""
     known = oc.load("gen3-wide")
@@ -257,6 +265,7 @@ def test_full_turns_of_endless_joints_bring_postures_into_a_box() -> None:
     assert np.linalg.norm(near.q - q, axis=1).max() < 0.05
 
 
+@pytest.mark.slow
 def test_where_full_turns_change_xi_an_arm_finds_as_many_as_its_chart() -> None:
     """All solutions within one and a half turns, as the chart's own search has them."""
     chart = oc.load("gen3-wide")

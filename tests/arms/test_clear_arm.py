@@ -29,6 +29,7 @@ def arm(tmp_path_factory: pytest.TempPathFactory) -> tuple[oc.Arm, Collisions]:
     return oc.Arm(task, (chart,)), robot.collisions.with_scene(oc.Scene({"post": post}))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("avoid", [None, 0.05])
 def test_an_arm_s_tracker_keeps_clear(arm: tuple[oc.Arm, Collisions], avoid: float | None) -> None:
     whole, around = arm

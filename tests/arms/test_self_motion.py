@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from conftest import arm as read_arm
-from programs import needs_c
+from programs import needs_c, nightly
 from random_arms import random_arm
 
 import orthocas as oc
@@ -62,10 +62,12 @@ def require_all_found(arm: oc.Arm, seed: int, poses: int, starts: int) -> None:
         assert ((q >= arm.robot.lower) & (q <= arm.robot.upper)).all()
 
 
+@pytest.mark.slow
 def test_postures_of_newtons_method_are_on_the_arcs_of_panda() -> None:
     require_all_found(panda(), seed=1, poses=5, starts=100)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("seed", [0, 2, 3])
 def test_postures_of_newtons_method_are_on_the_arcs_of_random_positions(seed: int) -> None:
     """Four joints, some of them sliding, turning up to 6 rad either way."""
@@ -73,7 +75,7 @@ def test_postures_of_newtons_method_are_on_the_arcs_of_random_positions(seed: in
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["iiwa7-wide", "xarm7-wide", "baxter-left-wide"])
+@pytest.mark.parametrize("name", ["xarm7-wide", *nightly("iiwa7-wide", "baxter-left-wide")])
 def test_postures_of_newtons_method_are_on_the_arcs_of_other_arms(name: str) -> None:
     require_all_found(oc.Arm(oc.Task.pose(oc.load(name).robot)), seed=2, poses=2, starts=100)
 
@@ -114,6 +116,7 @@ def test_ends_are_limits_and_next_to_them_arcs_would_leave() -> None:
                 assert abs(before[k] - stop.value) > 1e-9
 
 
+@pytest.mark.slow
 def test_arcs_of_joints_with_several_turns_differ_by_whole_turns() -> None:
     arm = oc.Arm(oc.Task.pose(oc.load("xarm7-wide").robot))
     q = postures(arm, 1, 3)[0]
@@ -196,12 +199,14 @@ def test_no_curve_is_found_twice() -> None:
             assert not any(lies_on(other, curve.q[3], curve.tangent[3]) for other in others)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ask", ["self_motion", "solve", "tracker"])
 def test_without_a_compiler_an_error_says_how_to_get_one(ask: str, monkeypatch: pytest.MonkeyPatch) -> None:
     arm, q = oc.Arm(panda().task, (oc.load("panda-wide"),)), postures(panda(), 1, 0)[0]
     x = arm.x(q)
     monkeypatch.setattr(shutil, "which", lambda _: None)
-    monkeypatch.setattr(importlib.util, "find_spec", lambda _: None)
+    find_spec = importlib.util.find_spec
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None if name == "ziglang" else find_spec(name))
     calls = {
         "self_motion": lambda: arm.self_motion(x),
         "solve": lambda: arm.solve(x, 0.1),
@@ -211,6 +216,7 @@ def test_without_a_compiler_an_error_says_how_to_get_one(ask: str, monkeypatch: 
         calls[ask]()
 
 
+@pytest.mark.slow
 def test_arcs_beyond_the_seam_of_a_curve_keep_x_where_joints_have_no_end() -> None:
     """Gen3's curves wind around its endless joints: pieces on both sides of the first point are full turns apart."""
     arm = oc.Arm(oc.load("gen3-wide").task)

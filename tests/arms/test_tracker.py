@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from programs import nightly
 
 import orthocas as oc
 from orthocas.arms import ArmTracker, TrackStatus
@@ -44,6 +45,7 @@ def along(x: Array, way: Array, steps: int) -> Array:
     return targets
 
 
+@pytest.mark.slow
 def test_inside_a_chart_x_and_xi_are_met() -> None:
     arm, chart, q = panda(), panda().charts[0], centre()
     tracker, phi = arm.tracker(q, period=PERIOD), chart.phi(centre())
@@ -114,7 +116,7 @@ def test_jumps_are_followed_as_fast_as_joints_may() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["iiwa7-wide", "xarm7-wide", "baxter-left-wide"])
+@pytest.mark.parametrize("name", ["xarm7-wide", *nightly("iiwa7-wide", "baxter-left-wide")])
 def test_hostile_streams_neither_break_limits_nor_lose_the_arm(name: str) -> None:
     """Jumps, targets out of reach and behind the base, NaN: afterwards, x and xi of the begin are met again."""
     chart, rng = oc.load(name), np.random.default_rng(4)
@@ -253,6 +255,7 @@ def test_following_a_path_is_a_call_for_each_of_its_values() -> None:
     assert np.abs(arm.x(q) - targets).max() < 1e-8
 
 
+@pytest.mark.slow
 def test_a_copied_tracker_goes_on_where_the_first_one_is() -> None:
     arm = panda()
     tracker, x = arm.tracker(centre()), arm.x(centre())

@@ -6,17 +6,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from programs import nightly
 
 import orthocas as oc
 from orthocas.arms import TrackStatus
 from orthocas.arms.chart_kernel import RULES, PosturesInC, tracker_type
-from orthocas.codegen.library import find_compilers
 from orthocas.errors import InvalidValueError
+from orthocas.native.libraries import find_compilers
 
 WARNINGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic")
 
 
-@pytest.mark.parametrize("name", ["panda-wide", "iiwa7-wide"])
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["panda-wide", *nightly("iiwa7-wide")])
 def test_generated_ticks_are_those_of_python(name: str, tmp_path: Path) -> None:
     """On a motion in the chart, jumps, NaN, and the way back to x and xi."""
     chart, rng = oc.load(name), np.random.default_rng(1)

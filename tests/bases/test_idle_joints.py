@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from conftest import Run, robot_data
+from programs import nightly
 
 import orthocas as oc
 from orthocas.errors import BranchWarning
@@ -29,7 +30,7 @@ def rounded(folder: Path, decimals: int) -> Path:
     return path
 
 
-@pytest.fixture(params=[11, 9])
+@pytest.fixture(params=[11, *nightly(9)])
 def robot(request: pytest.FixtureRequest, tmp_path: Path) -> oc.Robot:
     return oc.Robot.from_urdf(rounded(tmp_path, request.param), "tool0")
 

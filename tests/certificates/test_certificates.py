@@ -268,6 +268,7 @@ def test_numbers_that_no_check_covers_are_left_out_of_certificates(tmp_path: Pat
                 oc.load(path)
 
 
+@pytest.mark.slow
 def test_progress_is_of_what_is_left() -> None:
     """Where folds are kept out, the volume is soon proved and most boxes are left: it is no measure of the work."""
     known = problems.get("planar_3r_xy")

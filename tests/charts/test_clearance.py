@@ -108,6 +108,7 @@ def test_a_tracker_in_free_space_is_the_plain_one(arm: tuple[oc.Robot, oc.Chart]
         assert kept.status == plain.status
 
 
+@pytest.mark.slow
 def test_hostile_streams_touch_nothing(arm: tuple[oc.Robot, oc.Chart]) -> None:
     robot, chart = arm
     around = put_post(robot, place_ahead(chart, 0.7), radius=0.05)

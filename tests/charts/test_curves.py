@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 from dense_search import STARTS, positions_at
+from programs import nightly
 from public_objects import wide
 
 import orthocas as oc
@@ -12,7 +13,7 @@ FOUND, NEAREST = oc.InverseStatus.FOUND, oc.InverseStatus.NEAREST
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("name", ["panda-wide", "xarm7-wide"])
+@pytest.mark.parametrize("name", ["panda-wide", *nightly("xarm7-wide")])
 def test_no_random_start_leads_to_a_nearer_xi(name: str) -> None:
     """A wish whose x is that of another posture: a search from near the wish missed the nearest xi in one of seven."""
     chart = oc.charts.load(name)
@@ -33,11 +34,12 @@ def test_no_random_start_leads_to_a_nearer_xi(name: str) -> None:
     assert known > 20 * len(x)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["panda-wide", "iiwa7-pose", "ur10-position", "panda-position"])
 def test_all_solutions_are_those_that_random_starts_find(name: str) -> None:
-    """Newton's method from 2,000 of them."""
+    """Newton's method from 1,000 of them."""
     chart = oc.charts.load(name)
-    starts = sample_uniform(chart.problem.domain, 2000, 9)
+    starts = sample_uniform(chart.problem.domain, 1000, 9)
     for q in sample_uniform(chart.problem.domain, 4, 8):
         every = chart.solve(np.tile(chart.phi(q), (len(starts), 1)), starts)
         found, others = chart.solutions(chart.phi(q)), np.unique(every.q[every.found].round(7), axis=0)
@@ -64,6 +66,7 @@ def test_few_random_starts_lead_to_a_nearer_xi_where_curves_fill_surfaces() -> N
     assert nearer <= 1
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("inside", [False, True])
 @pytest.mark.parametrize("name", ["pr2-left-wide", "panda-position"])
 def test_where_nothing_leads_to_x_nothing_is_claimed(name: str, inside: bool) -> None:
@@ -75,6 +78,7 @@ def test_where_nothing_leads_to_x_nothing_is_claimed(name: str, inside: bool) ->
     assert np.isfinite(found.q).all()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("inside", [False, True])
 def test_positions_near_boundaries_are_found_again(inside: bool) -> None:
     """Of 2,000, 12 were missed, and with `inside` said to lie nowhere in the domain."""

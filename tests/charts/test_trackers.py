@@ -323,6 +323,7 @@ def test_c_goes_to_the_same_nearest_x(make: Callable[[], oc.Chart], tmp_path: Pa
     np.testing.assert_array_equal(same, outside)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["panda-wide", "xarm7-wide"])
 def test_steps_of_a_fifth_of_a_radian_are_found(name: str) -> None:
     """Where whole steps of Newton's method go too far, shorter ones lead to where they converge."""

@@ -355,6 +355,7 @@ def test_compare_writes_tables_pictures_and_charts(run: Run, tmp_path: Path) -> 
     assert json.loads(out)["summaries"][0]["solver"] == "closed form"
 
 
+@pytest.mark.slow
 def test_wide_fits_leave_postures_in_self_collision_aside(run: Run, tmp_path: Path) -> None:
     """A planar arm whose last links fold back: regular on the free part, which the facts name."""
     build_arm(tmp_path, [BALL, '<box size="0.6 0.2 0.1"/>', '<box size="0.6 0.2 0.1"/>', BALL])

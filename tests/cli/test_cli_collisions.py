@@ -30,6 +30,7 @@ def arm(run: Run) -> tuple[oc.Chart, Collisions]:
     return chart, robot.collisions
 
 
+@pytest.mark.slow
 def test_info_and_evaluate_have_the_share_that_touches(run: Run, arm: tuple[oc.Chart, Collisions]) -> None:
     chart, collisions = arm
     free = collisions.check_free(chart.domain.sample(10_000, 1))
@@ -72,6 +73,7 @@ def test_follow_refuses_contacts_and_says_which(run: Run, arm: tuple[oc.Chart, C
     assert "obstacle" in err
 
 
+@pytest.mark.slow
 def test_simulate_notes_the_nearest_pair(run: Run, arm: tuple[oc.Chart, Collisions]) -> None:
     Path("steps.json").write_text('{"duration": 0.3, "steps": [{"time": 0.1, "move": {"xi1": 0.01}}]}')
     words = ("a.orthocas", "--controller", "kinematic", "--steps", "steps.json", "--out", "out", "--animation", "none")

@@ -21,6 +21,7 @@ def arm_file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return path
 
 
+@pytest.mark.slow
 def test_charts_and_arms_are_solved(run: Run, arm_file: Path) -> None:
     arm, q = oc.Arm.load(arm_file), np.array([0.3, 0.9, 0.8])
     x, xi = arm.x(q), float(arm.charts[0].xi(q)[0])

@@ -86,6 +86,7 @@ def test_builders_that_fail_on_their_words_are_named(run: Run, monkeypatch: pyte
         oc.Task.named(oc.problems.get("iiwa").robot, "depe")
 
 
+@pytest.mark.slow
 def test_help_of_fit_lists_every_task(tmp_path: Path) -> None:
     program = """import sys, orthocas as oc
 oc.register_task("height", lambda robot, words: oc.Task.position(robot, "z"))
@@ -97,6 +98,7 @@ main()"""
         assert f"{kind}," in shown or f"{kind};" in shown
 
 
+@pytest.mark.slow
 def test_targets_of_references_are_said_to_be_values(planar_chart: oc.Chart) -> None:
     """As changes, these would be small."""
     q = planar_chart.problem.domain.centre

@@ -33,6 +33,7 @@ def sample(fitted: FittedCapsules) -> tuple[Array, Array]:
     return q, fitted.collisions.pair_distances(q)
 
 
+@pytest.mark.slow
 def test_distances_of_a_module_are_those_of_coal(arm: tuple[oc.Chart, FittedCapsules], tmp_path: Path) -> None:
     chart, fitted = arm
     q, pairs = sample(fitted)

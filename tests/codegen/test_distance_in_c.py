@@ -13,8 +13,9 @@ from solid_arms import BALL, build_arm
 
 import orthocas as oc
 from orthocas.codegen import GeneratedC
-from orthocas.codegen.library import NO_DOUBLE, STRICT, find_compilers
+from orthocas.codegen.library import NO_DOUBLE, STRICT
 from orthocas.errors import InvalidValueError
+from orthocas.native.libraries import find_compilers
 from orthocas.robots.capsules import FittedCapsules
 from orthocas.robots.collisions import Collisions, Part
 from orthocas.robots.shapes import BallGeometry, BoxGeometry, Shape
@@ -84,6 +85,7 @@ def arm(tmp_path_factory: pytest.TempPathFactory) -> tuple[oc.Robot, FittedCapsu
     return robot, oc.fit_capsules(robot.collisions.with_scene(scene))
 
 
+@pytest.mark.slow
 def test_capsules_contain_the_solids(arm: tuple[oc.Robot, FittedCapsules]) -> None:
     """Corners of pieces are within capsules, pieces are the hull together, and random points of solids inside."""
     robot, fitted = arm
@@ -142,6 +144,7 @@ def test_bad_postures_give_zeros(arm: tuple[oc.Robot, FittedCapsules], tmp_path:
         assert not points.any()
 
 
+@pytest.mark.slow
 def test_single_precision_and_few_pairs(arm: tuple[oc.Robot, FittedCapsules], tmp_path: Path) -> None:
     robot, fitted = arm
     compare(write(tmp_path, robot, fitted, single_precision=True), fitted.collisions, robot.sample(100, seed=9), 1e-5)
@@ -153,6 +156,7 @@ def test_single_precision_and_few_pairs(arm: tuple[oc.Robot, FittedCapsules], tm
     assert (distance > 1e10, gradient.any(), status) == (True, False, 0)
 
 
+@pytest.mark.slow
 def test_moving_bases_and_slides_are_placed_right(tmp_path: Path) -> None:
     robot = build_arm(tmp_path, [BALL, BALL, '<box size="0.3 0.1 0.1"/>'])
     rail = oc.Robot.from_urdf(tmp_path / "arm.urdf", "link2", base="rail:x")
@@ -218,6 +222,7 @@ class KeepClear:
         return result, float(distance[0]), status
 
 
+@pytest.mark.slow
 def test_steps_in_c_keep_clear_between_postures_too(arm: tuple[oc.Robot, FittedCapsules], tmp_path: Path) -> None:
     """Hostile steps, over half of a joint's range at once: never a contact, and no step that could have been longer."""
     robot, fitted = arm
@@ -258,6 +263,7 @@ def test_steps_in_c_keep_clear_between_postures_too(arm: tuple[oc.Robot, FittedC
         assert (status, distance, result.any()) == (3, 0.0, False)
 
 
+@pytest.mark.slow
 def test_pairs_whose_capsules_always_touch_are_left_out_and_named(tmp_path: Path) -> None:
     """Plates above each other at a joint: no posture brings them together, and all have their capsules touching."""
     robot = oc.Robot.planar([1.0, 1.0], [1.0, 1.0])

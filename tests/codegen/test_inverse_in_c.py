@@ -13,9 +13,9 @@ from programs import needs_c
 from public_objects import circle, clear, exact, wide
 
 import orthocas as oc
-from orthocas.codegen import compiled
 from orthocas.errors import CompileError, NoExpressionError
 from orthocas.fitting.fit import Fit
+from orthocas.native import libraries
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.expressions import wrap_shortest
 
@@ -141,7 +141,7 @@ def test_a_relative_cache_does_not_count(monkeypatch: pytest.MonkeyPatch, tmp_pa
     monkeypatch.setenv("HOME", str(tmp_path))
     for given, wanted in (("cache", tmp_path / ".cache"), ("", tmp_path / ".cache"), ("/var/tmp", Path("/var/tmp"))):
         monkeypatch.setenv("XDG_CACHE_HOME", given)
-        assert compiled._find_cache() == wanted / "orthocas" / "libraries"
+        assert libraries._find_cache() == wanted / "orthocas" / "libraries"
 
 
 @pytest.mark.slow
@@ -172,7 +172,7 @@ def test_compiled_curves_are_as_near(name: str, tmp_path: Path) -> None:
 def test_compiled_c_finds_what_random_starts_find(tmp_path: Path) -> None:
     """The nearest xi of xarm7-wide, whose joints turn twice, against 4,000 starts of damped least squares a row."""
     chart = oc.charts.load("xarm7-wide")
-    domain, count = chart.problem.domain, 16
+    domain, count = chart.problem.domain, 8
     wishes, x = sample_uniform(domain, count, 1), chart.x(sample_uniform(domain, count, 2))
     near, pool = oc.compile_inverse(chart, tmp_path).nearest_xi(wishes, x), sample_uniform(domain, STARTS, 3)
     for k in range(count):
@@ -180,6 +180,7 @@ def test_compiled_c_finds_what_random_starts_find(tmp_path: Path) -> None:
         assert near.distance[k] <= np.abs(chart.xi(others)[:, 0] - chart.xi(wishes[k])[0]).min() + 1e-6
 
 
+@pytest.mark.slow
 @needs_c
 def test_the_nearest_xi_may_lie_where_a_curve_begins(tmp_path: Path) -> None:
     """Newton's method ends where xi turns back, from where a closed curve inside the domain is traced.

@@ -180,6 +180,7 @@ def ends_on_its_reference(
     return True
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("rate", "delay"), [(1000.0, 0.0), (500.0, 0.0), (1000.0, 5e-3), (500.0, 6e-3)])
 def test_velocity_law_ends_on_its_reference_by_default(planar_arm: oc.Chart, rate: float, delay: float) -> None:
     rest = np.zeros(3)
@@ -193,6 +194,7 @@ def test_velocity_law_ends_on_its_reference_by_default(planar_arm: oc.Chart, rat
     assert not ends(Kinematic(planar_arm, 0.0))
 
 
+@pytest.mark.slow
 @needs_c
 def test_velocity_law_in_c_ends_on_its_reference_by_default(planar_arm: oc.Chart, tmp_path: Path) -> None:
     law, rest = Kinematic(planar_arm), np.zeros(3)

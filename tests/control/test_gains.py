@@ -185,6 +185,7 @@ def test_springs_in_series_with_the_inertia_add_their_compliances(planar_chart: 
         PDPlus(planar_chart, K, damping_stiffness=K, fastest=20.0)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["panda-wide", "xarm7-wide", "iiwa7-wide", "pr2-left-wide"])
 @pytest.mark.filterwarnings("ignore::orthocas.errors.LawWarning")
 def test_default_gains_let_every_mode_of_a_wide_chart_settle_within_a_second(name: str) -> None:

@@ -106,6 +106,7 @@ def test_mujoco_holds_an_arm_by_its_torque(robot: oc.Robot, model: pin.Model) ->
     np.testing.assert_allclose(plant.acceleration, fall, atol=1e-8 * np.abs(fall).max())
 
 
+@pytest.mark.slow
 def test_simulated_arm_rests_under_it(chart: oc.Chart, robot: oc.Robot) -> None:
     """On a robot that stands upright the same law lets it go: the difference of the torques is 20 N m and more."""
     reference = Reference.steps(chart.labels, chart.phi(HOME), [], 0.3)

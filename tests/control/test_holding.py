@@ -50,6 +50,7 @@ def gravity_of_pinocchio(chart: oc.Chart, points: Array) -> Array:
     return np.array(found)
 
 
+@pytest.mark.slow
 def test_laws_warn_with_the_torque_of_pinocchio_and_the_share_of_the_domain(chart: oc.Chart) -> None:
     domain, robot = chart.problem.domain, chart.problem.robot
     joint = robot.joint_names.index(SHOULDER)

@@ -36,7 +36,7 @@ def _waste_time(seed: int) -> str | None:
             pass
     elif seed == 1:
         signal.setitimer(signal.ITIMER_PROF, 0)  # as if the exception got lost
-        end = time.process_time() + 1.2
+        end = time.process_time() + 0.5
         while time.process_time() < end:
             pass
     elif seed == 2:
@@ -54,9 +54,9 @@ def test_too_much_memory_is_a_finding_though_it_is_returned_or_refused() -> None
 
 @pytest.mark.slow
 def test_too_much_time_is_a_finding_and_compiled_code_ends_too() -> None:
-    found = {finding.seed: finding.what for finding in run("limits", _waste_time, range(4), seconds=1.0)}
+    found = {finding.seed: finding.what for finding in run("limits", _waste_time, range(4), seconds=0.3)}
     assert set(found) == {0, 1, 2}
-    assert re.fullmatch(r"takes more than 1 s|takes \d\.\d s", found[0])
+    assert re.fullmatch(r"takes more than 0.3 s|takes \d\.\d s", found[0])
     assert re.fullmatch(r"takes \d\.\d s", found[1])
     by_the_kernel = f"its process died with exit code {-signal.SIGXCPU}"
     assert found[2] in (

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from conftest import robot_data
 from numpy.typing import NDArray
-from programs import Run, needs_c
+from programs import Run, needs_c, nightly
 
 import orthocas as oc
 from orthocas import control
@@ -68,8 +68,13 @@ def wrapped(angles: Numbers) -> Numbers:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("kind", SEW_KINDS)
-@pytest.mark.parametrize("name", list(ARMS))
+@pytest.mark.parametrize(
+    ("name", "kind"),
+    [
+        *zip(ARMS, SEW_KINDS * 2, strict=True),
+        *nightly(*zip(ARMS, SEW_KINDS[::-1] * 2, strict=True)),
+    ],
+)
 def test_xi_is_the_swivel_and_moves_it_by_what_is_asked(name: str, kind: SEWKind) -> None:
     fit, robot = swivel_fit(name, kind), robot_of(name)
     chart, domain, least = fit.chart, fit.chart.problem.domain, ARMS[name][3][SEW_KINDS.index(kind)]
@@ -182,6 +187,7 @@ def test_a_joint_that_is_regular_nearly_everywhere_is_the_coordinate_by_itself(t
     assert near.chart.parts.named_coordinates == ("xi1: like platform [rad]",)
 
 
+@pytest.mark.slow
 def test_coordinates_are_fitted_where_a_quantity_folds() -> None:
     """Joints of a planar arm: self-motions change the first one steadily, and turn the second one back."""
     known = oc.problems.get("planar_3r_xy")
@@ -223,6 +229,7 @@ def test_several_quantities_are_coordinates_if_there_are_enough_of_them() -> Non
         oc.fit_wide(robot, task, box, like=["q1", lambda q: 2 * q[0]], exact=True)
 
 
+@pytest.mark.slow
 def test_what_cannot_be_exact_is_refused() -> None:
     known = oc.problems.get("planar_3r_xy")
     robot, task = known.robot, known.task

@@ -134,6 +134,7 @@ def test_solvers_with_a_matrix_refuse_objectives_without_one(planar_xy: oc.Probl
         oc.fit(planar_xy, oc.MLP((4,)), solver, samples=50)
 
 
+@pytest.mark.slow
 def test_blocks_of_the_estimate_are_those_of_the_whole_matrix(monkeypatch: pytest.MonkeyPatch) -> None:
     """Of many coefficients the estimate is the diagonal of the matrix of few, and leads to the same minimum."""
     iiwa = problems.get("iiwa")

@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from conftest import ROBOTS, robot_data
-from programs import Run
+from programs import Run, nightly
 from public_objects import suggestion
 
 import orthocas as oc
@@ -37,6 +37,7 @@ def suggested(**asked: object) -> object:
     return oc.suggest_domain(*planar(), HOME, **{"parametrisation": oc.Polynomial(2, cyclic="auto"), **asked})
 
 
+@pytest.mark.slow
 def test_domains_are_suggested_for_linear_coordinates() -> None:
     """Trials are quadratic, which linear coordinates cannot begin from."""
     known = problems.get("planar_3r_x")
@@ -194,7 +195,7 @@ def test_progress_is_reported_and_ctrl_c_ends_the_search() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("joints", [6, 10])
+@pytest.mark.parametrize("joints", [6, *nightly(10)])
 def test_progress_rises_to_the_end_of_the_search_and_waits_nowhere(joints: int) -> None:
     seen: list[Progress] = []
     robot = oc.Robot.planar([3.0 / joints] * joints, [1.0] * joints)
@@ -292,6 +293,7 @@ def test_contradictory_options_are_refused(run: Run, words: tuple[str, ...], com
     assert complaint in err
 
 
+@pytest.mark.slow
 def test_box_is_searched_with_the_weights_of_the_fit(planar_xy: oc.Problem) -> None:
     boxes = {}
     for angles in ("paper", "metric"):

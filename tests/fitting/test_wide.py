@@ -120,6 +120,7 @@ def self_motions(robot: oc.Robot, q: Numbers) -> Numbers:
     return np.stack([signs[k] * np.linalg.det(np.delete(J, k, axis=2)) for k in range(robot.n)], axis=1)
 
 
+@pytest.mark.slow
 def test_branches_are_drawn_each_in_its_posture() -> None:
     found = branches()
     figure = found.plot()
@@ -355,6 +356,7 @@ class Shares:
         return SimpleNamespace(regular_share=share, status=None)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("centre", "small"), [([0.0, 0.0, 0.0], True), ([0.0, 1.3, 1.3], False)])
 def test_the_printed_share_is_of_the_branch(centre: list[float], small: bool) -> None:
     """A straight arm in the middle: the chart says how little of the box it has, and why."""
@@ -434,7 +436,7 @@ def test_several_coordinates_are_regular_together() -> None:
 def test_coordinates_in_the_metric_of_the_inertia_are_regular_in_the_domain() -> None:
     """Orthogonal in M, four coordinates of the arm are nearly parallel otherwise, and the domain would be empty."""
     task, cubic = oc.Task.position(iiwa()), oc.Polynomial(3, ["A1"])
-    fit = oc.fit_wide(iiwa(), task, home_branch(), "inertia", parametrisation=cubic, samples=2500)
+    fit = oc.fit_wide(iiwa(), task, home_branch(), "inertia", parametrisation=cubic, samples=1500)
     assert fit.regular_share > 0.99
     q = sample_uniform(fit.chart.problem.domain, 2000, 6)
     J = np.concatenate([geometric_jacobians(iiwa(), q)[:, :3], fit.chart.coordinates.jacobian(q)], axis=1)
@@ -771,10 +773,10 @@ def test_command_fits_a_branch(run: Run) -> None:
         "--out",
         "a",
     )
-    code, out, err = run(*words, "--domain", "branch:shoulder+ elbow- wrist+", "--samples", "3000", "--json")
+    code, out, err = run(*words, "--domain", "branch:shoulder+ elbow- wrist+", "--samples", "1000", "--json")
     assert (code, err) == (0, "")
     assert json.loads(out)["branch"] == "shoulder+ elbow- wrist+"
-    code, out, _ = run(*words, "--domain", "branch:shoulder+ elbow- wrist+", "--samples", "3000", "--force")
+    code, out, _ = run(*words, "--domain", "branch:shoulder+ elbow- wrist+", "--samples", "1000", "--force")
     assert code == 0
     assert ": xi1: like swivel [rad]" in out
     message = "orthocas: --domain branch has a solver of its own: leave out --solver\n"
@@ -783,6 +785,7 @@ def test_command_fits_a_branch(run: Run) -> None:
     assert run("fit", "iiwa", "--branch", "up")[::2] == (2, message)
 
 
+@pytest.mark.slow
 def test_command_weighs_the_terms_of_a_wide_fit(run: Run) -> None:
     """Numbers are weights of leaks in the metric; terms by name join the weights that wide fits have of their own."""
     words = ("fit", "planar_3r_xy", "--metric", "euclidean", "--domain", "branch", "--param", "polynomial:3")
@@ -808,6 +811,7 @@ def test_command_weighs_the_terms_of_a_wide_fit(run: Run) -> None:
     assert "unknown loss term 'calm'" in run(*words, "--weights", "calm=3")[2]
 
 
+@pytest.mark.slow
 def test_command_notes_what_a_chart_leaves_out_of_its_branch(run: Run) -> None:
     """Also in its rows and in JSON; a warning of Python would be an error here."""
     file = robot_data("z1_description/urdf/z1.urdf")
@@ -938,6 +942,7 @@ def test_poor_results_ask_for_another_polynomial_and_very_poor_ones_for_a_networ
     assert (tried, went_on) == (begun, [kept])
 
 
+@pytest.mark.slow
 def test_ctrl_c_before_a_network_has_a_middle_is_no_error_of_the_domain(monkeypatch: pytest.MonkeyPatch) -> None:
     def pressed(self: Resampled, size: int, count: int, seed: tuple[int, ...]) -> Any:
         raise KeyboardInterrupt
@@ -978,6 +983,7 @@ class Evenness:
         return coordinate_jacobian[:, 1]
 
 
+@pytest.mark.slow
 def test_terms_and_weights_of_users_reach_wide_fits() -> None:
     known = oc.problems.get("planar_3r_xy")
     oc.register_loss_term(Evenness())
@@ -1003,6 +1009,7 @@ def test_terms_and_weights_of_users_reach_wide_fits() -> None:
         fit(weights={"third joint": 1.0})
 
 
+@pytest.mark.slow
 def test_families_of_users_reach_wide_fits() -> None:
     """One with no more than expressions, not linear in its parameters."""
 

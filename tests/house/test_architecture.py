@@ -20,7 +20,7 @@ SOURCES = {
 MODULES = {name.removesuffix(".__init__"): path for name, path in SOURCES.items()}
 FACES = ("orthocas.__main__",)  # what nothing else may import
 ORDER = (  # packages import what stands before them, and nothing else
-    *("errors", "version", "tools", "solvers", "robots", "tasks", "bases", "exact", "charts", "certificates"),
+    *("errors", "version", "tools", "native", "solvers", "robots", "tasks", "bases", "exact", "charts", "certificates"),
     *("control", "learn", "codegen", "simulation", "fitting", "paths", "arms", "problems", "viewer", "cli"),
 )
 
@@ -174,6 +174,7 @@ def test_there_are_sources_to_check() -> None:
     assert {package(name) for name in MODULES if name not in (*FACES, "orthocas")} == set(ORDER)
 
 
+@pytest.mark.slow
 def test_files_import_in_no_circle() -> None:
     """Imports in functions count, too; those that only types need do not."""
     assert circle({name: imports_of(path, inside=True, named=False) for name, path in MODULES.items()}) == []

@@ -10,6 +10,7 @@ import casadi as ca
 import casadi_dynamics
 import certificates
 import clear_positions
+import collision_scenes
 import collisions
 import compare_parametrisations
 import contact
@@ -342,6 +343,14 @@ def test_benchmark_beyond_reach_finds_nothing_nearer() -> None:
 
 
 @pytest.mark.nightly
+def test_benchmark_of_scenes_moves_the_elbow_into_a_slot() -> None:
+    """Without pink, whose barrier then has no answer; contacts are looked for at all ticks and between them."""
+    found = collision_scenes.main(quick=True)
+    assert found["into a slot, planned, done"] == found["into a slot, ours, done"] == 1
+    assert found["into a slot, ours, contacts"] == 0
+
+
+@pytest.mark.nightly
 def test_benchmark_of_collisions_agrees_with_coal_and_touches_nothing() -> None:
     found = collisions.main(quick=True)
     assert found["panda, differ"] == 0
@@ -395,7 +404,7 @@ def test_gradients_agree_with_pytorch() -> None:
     assert len(gradients.main(quick=True)) == 2  # it checks values and gradients before timing
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_the_elbow_angle_leans_farther_into_the_task_than_fitted_coordinates() -> None:
     """The benchmark takes leaks straight from Jacobians; `evaluate` has formulas of its own."""
     found = {name: numbers["leak rms [deg]"] for name, numbers in elbow_angle.main(quick=True).items()}
@@ -415,7 +424,7 @@ def test_the_elbow_angle_leans_farther_into_the_task_than_fitted_coordinates() -
         np.testing.assert_allclose(same.xi(points), own.xi(points), atol=1e-12)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_benchmark_of_quantities_has_them_exactly_and_nearly() -> None:
     exact, near = quantities.main(quick=True)
     assert [row.split(" | ")[0] for row in (*exact, *near)] == [

@@ -369,6 +369,7 @@ def test_motions_are_read_only() -> None:
         assert not getattr(motion(), name).flags.writeable
 
 
+@pytest.mark.slow
 def test_two_arms_follow_a_path_of_their_relative_pose() -> None:
     """The path in x is met at every time stamp, with the links of both arms kept clear of a floor."""
     tips = ["left_gripper", "right_gripper"]

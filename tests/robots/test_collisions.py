@@ -265,6 +265,7 @@ def test_bounds_leave_out_no_pair_of_many() -> None:
         }
 
 
+@pytest.mark.slow
 def test_ways_between_postures_hide_no_contact(tmp_path: Path) -> None:
     """A post of 2 mm, which no posture of the way touches: dense samples are the second route."""
     robot = build_arm(tmp_path, ["", '<box size="0.3 0.05 0.05"/>', '<box size="0.3 0.02 0.02"/>'])
@@ -413,6 +414,7 @@ HAND = """<link name="{side}hand"><collision><geometry><sphere radius="0.05"/></
 </joint>"""
 
 
+@pytest.mark.slow
 def test_a_box_in_both_hands_moves_with_them_and_hits_what_is_around(tmp_path: Path) -> None:
     """The left hand carries it, the right hand may touch it; coordinates of both arms keep it between the hands."""
     parts = []

@@ -187,6 +187,7 @@ def test_chart_of_an_arm_with_mimic_joints_is_fitted_saved_and_inverted(robot: o
     assert abs(dq @ tree.mass_matrix(q) @ dq / start - 1) < 1e-6
 
 
+@pytest.mark.slow
 def test_law_on_mimic_joints_follows_a_step_and_agrees_in_c(robot: oc.Robot, tmp_path: Path) -> None:
     domain = oc.Box([0.3, 0.6, 0.2, 0.9, 0.3, 0.0], 0.3)
     chart = oc.fit(oc.Problem(robot, oc.Task.position(robot, "xyz"), "inertia", domain), oc.Polynomial(2)).chart

@@ -18,6 +18,7 @@ from orthocas.tools.checks import Array
 RADIUS = 0.04
 
 
+@pytest.mark.slow
 def test_rods_lie_between_the_joints() -> None:
     robot, rng, shares = problems.get("iiwa").robot, np.random.default_rng(3), np.linspace(0, 1, 401)[:, None]
     post = Capsule(rng.normal(size=3), rng.normal(size=3), 0.1)

@@ -38,6 +38,7 @@ def test_a_joint_slows_down_with_coulomb_friction_and_then_stands_exactly(slider
     assert (plant.q[0], plant.dq[0]) == (stood, 0.0)
 
 
+@pytest.mark.slow
 def test_a_joint_on_a_pulled_spring_sticks_and_slips_by_twice_the_excess(slider: oc.Robot) -> None:
     """Slips of 2 (breakaway - coulomb) / k where friction falls at once: and what is pulled meanwhile: half a swing."""
     coulomb, breakaway, k = 1.0, 1.5, 10_000.0
@@ -94,6 +95,7 @@ def test_seven_joints_move_and_stick_as_in_mujoco() -> None:
     assert (fine.dq == 0).any()
 
 
+@pytest.mark.slow
 def test_without_friction_energy_and_motion_are_those_of_the_arm(planar_chart: oc.Chart) -> None:
     """A fall of 0.5 s in steps of 0.05 ms, beside CVODES through `simulate` with a law that commands nothing."""
     robot = planar_chart.problem.robot

@@ -12,7 +12,7 @@ from orthocas.simulation import Friction, StickingPlant
 pytestmark = needs_c
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_an_arm_that_sticks_reaches_x_and_xi_and_is_not_caught() -> None:
     """A bare wrist jumps beyond its limit of speed as it breaks away, and the arm stands still under torques."""
     chart = oc.load("iiwa7-pose")

@@ -134,6 +134,7 @@ def sides(chart: oc.Chart, q: Array) -> list[tuple[int, float, Stop]]:
     return [side for side in found if np.isfinite(side[1])]
 
 
+@pytest.mark.slow
 @CHARTS
 @KINDS
 def test_ranges_end_where_the_domain_ends(kind: str, axes: str) -> None:
@@ -160,6 +161,7 @@ def test_ranges_end_where_the_domain_ends(kind: str, axes: str) -> None:
     assert StopKind.NEAR_SINGULAR in seen or kind != "clear box" or axes == "x"
 
 
+@pytest.mark.slow
 @CHARTS
 @KINDS
 def test_self_motions_stay_inside_and_keep_x(kind: str, axes: str) -> None:
@@ -173,6 +175,7 @@ def test_self_motions_stay_inside_and_keep_x(kind: str, axes: str) -> None:
         assert kinds <= ENDS[kind] | FOLDS
 
 
+@pytest.mark.slow
 @CHARTS
 @KINDS
 @pytest.mark.parametrize("inside", [False, True])
@@ -192,6 +195,7 @@ def test_values_within_a_range_are_found_from_there(kind: str, axes: str, inside
     np.testing.assert_allclose(chart.parts.phi_map.residual(np.array(targets), found.q), 0, atol=1e-8)
 
 
+@pytest.mark.slow
 @CHARTS
 @KINDS
 def test_statuses_of_the_inverse_say_where_q_lies(kind: str, axes: str) -> None:
@@ -214,6 +218,7 @@ def test_statuses_of_the_inverse_say_where_q_lies(kind: str, axes: str) -> None:
     assert (near.status == NEAREST).sum() > 8 or kind == "torus"  # where xi has no end
 
 
+@pytest.mark.slow
 @CHARTS
 @KINDS
 def test_nearest_xi_is_no_farther_than_a_known_position(kind: str, axes: str) -> None:
@@ -257,6 +262,7 @@ def refuses_trackers(chart: oc.Chart) -> bool:
     return True
 
 
+@pytest.mark.slow
 @CHARTS
 @KINDS
 def test_trackers_go_to_the_end_of_a_range_and_stay(kind: str, axes: str) -> None:
@@ -290,6 +296,7 @@ def cost(chart: oc.Chart, phi: Array, q: Array) -> Array:
     return np.asarray(((chart.parts.phi_map.difference(phi, chart.phi(q)) * weights) ** 2).sum(axis=1))
 
 
+@pytest.mark.slow
 @CHARTS
 @KINDS
 def test_reaching_trackers_rest_where_no_neighbour_is_nearer(kind: str, axes: str) -> None:

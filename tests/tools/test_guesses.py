@@ -32,6 +32,7 @@ def _reference(chart: oc.Chart, q: Any) -> pin.SE3:
     return pin.SE3(np.asarray(chart.robot.tip_rotation(q)), np.asarray(chart.robot.tip_position(q)))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "as_held",
     [
@@ -179,6 +180,7 @@ def test_what_is_suggested_exists(chart: oc.Chart) -> None:
                     value = Collisions if part == "collisions" else getattr(value, part)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("words", [("evaluate", "--samples", "200"), ("info",)])
 def test_commands_take_names_of_ready_charts(words: tuple[str, ...], tmp_path: Path) -> None:
     command = Path(sys.executable).with_name("orthocas")
