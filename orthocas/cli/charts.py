@@ -14,7 +14,7 @@ import typer
 from orthocas.charts import quality
 from orthocas.charts.certificate import METHODS
 from orthocas.charts.chart_file import CHART
-from orthocas.charts.ready import Card, card, load, names
+from orthocas.charts.ready import card, load, names
 from orthocas.cli.options import (
     AsJson,
     ChartPath,
@@ -52,6 +52,7 @@ def charts(
     json: AsJson = False,
 ) -> None:
     """List the ready charts of known arms, show the card of one, or write it to a file."""
+    # Without a name, all of them in a table.
     if name is None:
         if out is not None:
             raise OptionError("--out requires the name of a ready chart")
@@ -59,9 +60,16 @@ def charts(
         if json:
             print_json({"charts": [ready.as_dict() for ready in cards]})
         else:
-            head = ("name", "robot", "n", "m", "r", "leak [deg]", "least conditioning", "licence")
-            print_table([head, *map(_format_card, cards)])
+            head = ("name", "robot", "n m r", "leak [deg]", "least conditioning", "licence")
+            rows: list[tuple[str, ...]] = [head]
+            for ready in cards:
+                numbers = ready.quality
+                sizes = " ".join(str(numbers[size]) for size in "nmr")
+                leak, least = f"{numbers['leak_deg']['rms']:.2f}", f"{numbers['conditioning']['min']:.2f}"
+                rows.append((ready.name, ready.model.robot, sizes, leak, least, ready.model.licence))
+            print_table(rows, f"orthocas view {cards[0].name}")
         return
+    # One chart: its card, and its file if that is asked for.
     ready = card(name)
     if out is not None:
         load(name).save(out, force)
@@ -71,13 +79,6 @@ def charts(
     else:
         commands = {f"command {k}": line for k, line in enumerate(ready.commands, 1)}
         print_rows({**ready.facts(), **commands, **written})
-
-
-def _format_card(ready: Card) -> tuple[str, ...]:
-    numbers = ready.quality
-    sizes = (str(numbers[name]) for name in "nmr")
-    leak, least = f"{numbers['leak_deg']['rms']:.2f}", f"{numbers['conditioning']['min']:.2f}"
-    return ready.name, ready.model.robot, *sizes, leak, least, ready.model.licence
 
 
 def evaluate(

@@ -116,7 +116,7 @@ def codegen(
     if json:
         print_json(report)
     else:
-        print_rows(_format_rows(report))
+        print_rows(_format_rows(report), "" if check else f"cmake -S {out} -B {out}/build && cmake --build {out}/build")
     for remark in remarks:
         note(remark)
 

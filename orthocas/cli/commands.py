@@ -48,7 +48,7 @@ def build_app(words: Sequence[str]) -> typer.Typer:
         module = f"{__package__}.{_MODULES.get(name, name)}"
         # Nothing stands for a command that is not called.
         command = getattr(import_module(module), name) if name in words else lambda: None
-        app.command(name, help=None if name in words else summary)(command)
+        app.command(name, help=None if name in words else summary, short_help=summary)(command)
     return app
 
 

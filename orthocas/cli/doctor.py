@@ -124,6 +124,7 @@ def _leading_numbers(version: str) -> list[int]:
 def find_compiler_versions() -> list[str]:
     """What the C compilers on the PATH say of themselves."""
     found = [path for name in ("gcc", "clang") if (path := shutil.which(name)) is not None]
+    # Other systems call their compiler cc.
     found = found or [path for path in (shutil.which("cc"),) if path is not None]
     said = [subprocess.run([path, "--version"], capture_output=True, text=True, check=False).stdout for path in found]
     return [text.splitlines()[0].strip() for text in said if text]

@@ -52,6 +52,7 @@ def info(
     json: AsJson = False,
 ) -> None:
     """Show a chart, a named problem, or a robot."""
+    # A robot has joints and what is redundant for usual tasks; problems and charts have a task and a domain.
     if is_robot_file(target):
         robot = words.build_robot(target)
         data = {

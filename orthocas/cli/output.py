@@ -7,6 +7,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import typer
 
 from orthocas.errors import InvalidValueError, one_line, printable
@@ -30,6 +31,7 @@ def print_json(data: Mapping[str, Any]) -> None:
 
 def print_rows(rows: dict[str, str], then: str = "") -> None:
     """Print names and values in two columns; to people also what to do next, a command."""
+    # People get a table as wide as their terminal; files and pipes one line a row, which programs can read.
     if sys.stdout.isatty():
         _draw(list((rows | {"next": then} if then else rows).items()))
         return
@@ -46,6 +48,7 @@ def print_table(rows: Sequence[Sequence[str]], then: str = "") -> None:
         if then:
             print_rows({"next": then})
         return
+    # A long last cell, such as an explanation, does not widen its column for all rows.
     aligned = [row if len(row) == len(head) else row[:-1] for row in rows]
     widths = [max(len(row[k]) for row in aligned if k < len(row)) for k in range(len(head))]
     for row in rows:
@@ -61,7 +64,11 @@ def _draw(rows: Sequence[Sequence[str]], head: Sequence[str] = ()) -> None:
 
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), show_header=bool(head), header_style="bold")
     for k in range(max(map(len, rows))):
-        table.add_column(head[k] if head else "", no_wrap=k == 0, overflow="fold", style="cyan" if k == 0 else "")
+        title = head[k] if head else ""
+        # Rich folds words where a column is narrower than they are: a column is as wide as its longest word.
+        words = [word for row in rows for word in row[k].split()] if k else []
+        longest = min(max(map(len, (*title.split(), *words)), default=0), 20)
+        table.add_column(title, no_wrap=k == 0, overflow="fold", style="cyan" if k == 0 else "", min_width=longest)
     for row in rows:
         table.add_row(*(Text(printable(cell)) for cell in row))
     Console().print(table)
@@ -74,6 +81,7 @@ def note(text: str) -> None:
 
 def format_report_rows(report: "Report", chart: "Chart") -> dict[str, str]:
     """The rows of a quality report, with what is normal for a wide chart, or advice on options for a tight one."""
+    # The standards of tight charts say nothing of wide ones, whose leaks are large by nature.
     rows = report.facts()
     if "branch" in chart.notes:
         rows["wide"] = (
@@ -86,7 +94,7 @@ def format_report_rows(report: "Report", chart: "Chart") -> dict[str, str]:
 
 
 def format_reach_rows(chart: "Chart") -> dict[str, str]:
-    """The ranges of xi in one row."""
+    """The ranges of xi in one row, and how far the joints move for a unit of it at the home: |dq/dxi|."""
     if (reach := _find_reach(chart)) is None:
         return {}
     named = [name.partition(": ")[2] for name in chart.parts.named_coordinates]
@@ -94,7 +102,11 @@ def format_reach_rows(chart: "Chart") -> dict[str, str]:
         f"{part.label} {part.low:.3g} to {part.high:.3g}{f' ({name})' if name else ''}"
         for part, name in zip(reach, named, strict=True)
     ]
-    return {"xi reach": ", ".join(texts)}
+    # Columns of the inverse Jacobian: what xi is worth, whatever metric scales it.
+    moved = np.linalg.norm(np.linalg.inv(chart.jacobian(chart.problem.domain.home))[:, chart.m :], axis=0)
+    unit = "rad or m" if any(chart.robot.tree.prismatic) else "rad"
+    worth = ", ".join(f"{part.label} {length:.2g}" for part, length in zip(reach, moved, strict=True))
+    return {"xi reach": ", ".join(texts), "xi unit": f"moves the joints by [{unit}] {worth}"}
 
 
 def build_reach_data(chart: "Chart") -> dict[str, Any]:
@@ -130,6 +142,7 @@ def terminal_monitor() -> Iterator[Monitor]:
 @contextmanager
 def lines_of_progress(pause: float) -> Iterator[Monitor]:
     """A monitor whose last report is printed every `pause` seconds, also while one step takes longer than that."""
+    # A thread of its own speaks, because one step of a fit may take longer than the pause.
     begin, reports, ended = time.monotonic(), [""], threading.Event()
 
     def show(progress: Progress) -> None:

@@ -103,8 +103,15 @@ def simulate(
     """Run a controller in a chart's coordinates; write the run, pictures, an animation and a report."""
     # What can be refused is refused before the chart is read.
     require_settings(controller, settings)
-    _check_torques(controller, {"--mass-factor": mass_factor, "--friction": friction})
-    _check_plant(plant, rate, supervised)
+    for option, value in {"--mass-factor": mass_factor, "--friction": friction}.items():
+        if value is not None and law_of(controller).command != "torque":
+            takers = ", ".join(name for name in CONTROLLERS if law_of(name).command == "torque")
+            raise OptionError(f"{controller} has no {option}, which belongs to {takers}")
+    require_known("plant", plant, (CVODES, MUJOCO))
+    if plant == MUJOCO and rate is None:
+        raise OptionError("--plant mujoco requires --rate: MuJoCo runs with a sampled controller")
+    if supervised and rate is None:
+        raise OptionError("--supervised requires --rate: a supervised law runs tick by tick")
     _check_folder(out, animation, force)
     # CasADi may lose Ctrl-C while it builds functions.
     with deferred():
@@ -157,23 +164,6 @@ def _check_folder(out: Path, animation: str, force: bool) -> None:
     require_writable(out / "report.json" if out.is_dir() else out, ArchiveError)
     names = [*_FILES] if animation == "none" else [*_FILES, f"animation.{animation}"]
     require_replaceable_files(out, names, force)
-
-
-def _check_torques(controller: str, conditions: dict[str, object]) -> None:
-    """Raise OptionError for conditions of the plant that matter only to laws that command torques."""
-    for option, value in conditions.items():
-        if value is not None and law_of(controller).command != "torque":
-            takers = ", ".join(name for name in CONTROLLERS if law_of(name).command == "torque")
-            raise OptionError(f"{controller} has no {option}, which belongs to {takers}")
-
-
-def _check_plant(plant: str, rate: float | None, supervised: bool) -> None:
-    """Raise UnknownNameError for other plants, and InvalidValueError where a sampled controller is missing."""
-    require_known("plant", plant, (CVODES, MUJOCO))
-    if plant == MUJOCO and rate is None:
-        raise OptionError("--plant mujoco requires --rate: MuJoCo runs with a sampled controller")
-    if supervised and rate is None:
-        raise OptionError("--supervised requires --rate: a supervised law runs tick by tick")
 
 
 def _build_plant(plant: str, model: Robot, mass_factor: float | None) -> Robot | MuJoCo | None:

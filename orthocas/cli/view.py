@@ -129,12 +129,14 @@ def _read_scene(target: str, chart: Path | None, meshes: Path | None, words: Pro
     """What the target is: by its suffix, or a folder of a run, or the name of a problem."""
     place = Path(target)
     locked = words.parse_locks()
+    # A robot without a chart has a slider for each joint.
     if is_robot_file(target):
         meshes = place if meshes is None and place.suffix.lower() == ".urdf" else meshes
         return _Scene(words.build_robot(target), None, meshes, locked)
     if target in problems.names() and not place.exists():
         words.require_no_robot(f"the named problem '{target}'")
         return _Scene(problems.get(target).robot, None, meshes, locked)
+    # Motions move a robot that their files do not hold.
     if place.is_dir() or place.suffix.lower() in (".npz", ".csv", ".mcap"):
         if chart is None and meshes is None:
             raise OptionError("files of motions hold no robot: give --chart or --robot")

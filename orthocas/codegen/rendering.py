@@ -61,7 +61,7 @@ def render(template: str, values: Mapping[str, Any]) -> str:
 
 @cache
 def _environment() -> Environment:
-    """Blocks vanish with their lines; `x | numbers` are literals of C, and `x | array` an initialiser."""
+    """Blocks vanish with their lines; `x | numbers` are literals of C, `x | array` and `x | strings` initialisers."""
     # Missing names are errors, and generated text is not HTML.
     environment = Environment(
         loader=PackageLoader("orthocas.codegen", "templates"),
@@ -72,8 +72,14 @@ def _environment() -> Environment:
         autoescape=False,
     )
     environment.filters |= {"numbers": write_numbers, "array": lambda values: f"{{{write_numbers(values)}}}"}
+    environment.filters["strings"] = lambda words: f"{{{', '.join(map(_quote, words))}}}"
     environment.filters["code"] = _translate
     return environment
+
+
+def _quote(word: str) -> str:
+    """A string of C; a quote in it would end it."""
+    return '"' + word.replace('"', "'") + '"'
 
 
 @pass_context

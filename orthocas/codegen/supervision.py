@@ -135,6 +135,7 @@ def describe_law(controller: Controller) -> dict[str, Any]:
         "law": controller.formula,
         "k": len(controller.labels),
         "reference_labels": ", ".join(clean_words(controller.labels)),
+        "reference_names": clean_words(controller.labels),
         "gains": [
             {
                 "name": name,

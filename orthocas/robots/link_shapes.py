@@ -49,7 +49,7 @@ def place_links(
     Raises:
         RobotError: if the file cannot be read, or its joints are not those of the robot.
     """
-    whole, mimics = (read_mjcf(path), {}) if path.suffix.lower() == MJCF else read_urdf(path)
+    whole, mimics = read_mjcf(path, locked) if path.suffix.lower() == MJCF else read_urdf(path)
     model = lock_joints(whole, locked or {}, mimics)
     if lost := [name for name in tree.body_joints if name not in (*model.names, *BASE_JOINTS)]:
         raise RobotError(f"{path} has the joints {listed(list(model.names)[1:])}, expected {listed(lost)} among them")

@@ -1,12 +1,14 @@
 """MJCF files and MuJoCo's compiled models as a `pin.Model` with the mass matrix and bias of MuJoCo."""
 
 import re
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 import pinocchio as pin
 
 from orthocas.errors import RobotError, one_line
+from orthocas.robots.pinocchio_model import Mimic, resolve_mimics
 from orthocas.robots.urdf import RULES, read_xml
 from orthocas.tools.checks import Array, as_path, import_extra
 
@@ -14,8 +16,8 @@ from orthocas.tools.checks import Array, as_path, import_extra
 _WORDS = ("name", "class", "childclass", "joint", "body", "file", "mesh", "material")
 
 
-def read_mjcf(source: Any) -> pin.Model:
-    """The kinematics, masses, armatures, limits of position and effort, and gravity of an MJCF file.
+def read_mjcf(source: Any, locked: Mapping[str, float] | None = None) -> tuple[pin.Model, dict[str, Mimic]]:
+    """The kinematics, masses, armatures, limits of position and effort, gravity, and mimic joints of an MJCF file.
 
     MuJoCo's own compiler reads the file, with meshes, includes, default classes, attached and replicated bodies. The
     model has a frame for every body, named site and joint. If they share a name, `find_frame` prefers the body to the
@@ -23,23 +25,28 @@ def read_mjcf(source: Any) -> pin.Model:
     indices i. Named keyframes become reference configurations.
 
     Mass matrix and bias are those of MuJoCo (qM and qfrc_bias). A `Robot` has no passive and constraint forces:
-    springs, damping, friction, gravity compensation (gravcomp), fluids, contacts and <equality>.
+    springs, damping, friction, gravity compensation (gravcomp), fluids and contacts. Of <equality>, active couplings of
+    two joints that are linear hold exactly: the first one mimics the second. Others are no part of a `Robot`.
 
     The effort limit of a joint is the sum of |gear| times the force range of its actuators, or of |gain| times the
     control range of motors, and at most its actuatorfrcrange.
 
     Args:
         source: the path of a file, or a `mujoco.MjModel`.
+        locked: joints that the caller locks: couplings in MuJoCo yield, so these follow no more.
 
     Raises:
         MissingExtraError: if MuJoCo is not installed.
         RobotError: if MuJoCo refuses the file, or the model has no joint, armatures of tendons or actuators, or
-            flexible bodies.
+            flexible bodies, or joints follow each other in a loop.
     """
     mujoco = import_extra("mujoco", "reading MJCF files", "mujoco")
     if isinstance(source, mujoco.MjModel):
-        return _convert(mujoco, source, "the model")
-    return _convert(mujoco, compile_mjcf(source), str(as_path("path", source)))
+        compiled, name = source, "the model"
+    else:
+        compiled, name = compile_mjcf(source), str(as_path("path", source))
+    mimics = _find_mimics(mujoco, compiled)
+    return _convert(mujoco, compiled, name), {k: mimic for k, mimic in mimics.items() if k not in (locked or {})}
 
 
 def compile_mjcf(path: Any) -> Any:
@@ -79,6 +86,21 @@ def _convert(mujoco: Any, compiled: Any, name: str) -> pin.Model:
         if compiled.key(i).name:
             model.referenceConfigurations[compiled.key(i).name] = compiled.key_qpos[i]
     return model
+
+
+def _find_mimics(mujoco: Any, compiled: Any) -> dict[str, Mimic]:
+    """Joints that follow others: q1 - ref1 = a0 + a1 (q2 - ref2), where MuJoCo's polynomial has no higher terms."""
+    direct = {}
+    for i in range(compiled.neq):
+        first, second = int(compiled.eq_obj1id[i]), int(compiled.eq_obj2id[i])
+        coupled = compiled.eq_type[i] == mujoco.mjtEq.mjEQ_JOINT and second >= 0 and compiled.eq_active0[i]
+        a0, a1, *higher = compiled.eq_data[i][:5]
+        if not coupled or any(higher) or not a1:
+            continue
+        names = [compiled.joint(k).name or f"joint{k}" for k in (first, second)]
+        ref1, ref2 = (float(compiled.qpos0[compiled.jnt_qposadr[k]]) for k in (first, second))
+        direct[names[0]] = Mimic(names[1], float(a1), ref1 + float(a0) - float(a1) * ref2)
+    return resolve_mimics(direct)
 
 
 def _refuse_unread(compiled: Any, name: str) -> None:

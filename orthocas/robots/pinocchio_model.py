@@ -39,6 +39,28 @@ class Mimic(NamedTuple):
 Mimics = Mapping[str, Mimic]  #: by the name of the joint that follows
 
 
+def resolve_mimics(direct: Mimics) -> dict[str, Mimic]:
+    """Each joint that follows, with its independent leader: leaders in `direct` may follow others.
+
+    Raises:
+        RobotError: if joints follow each other in a loop.
+    """
+    resolved = {}
+    for name in direct:
+        leader, factor, offset, passed = name, 1.0, 0.0, set[str]()
+        # Factors multiply, offsets add up.
+        while leader in direct:
+            if leader in passed:
+                raise RobotError(f"joint '{name}' mimics itself")
+            passed.add(leader)
+            step = direct[leader]
+            offset += factor * step.offset
+            factor *= step.factor
+            leader = step.leader
+        resolved[name] = Mimic(leader, factor, offset)
+    return resolved
+
+
 def build_tree(model: pin.Model, *tips: str, base: str | None = None, mimics: Mimics | None = None) -> KinematicTree:
     """Read joints, bodies, limits, tips and links from a Pinocchio model, whose base may move; see `place_on_base`.
 

@@ -191,7 +191,7 @@ class Robot(Shown):
 
         Needs the extra `orthocas[mujoco]`, because MuJoCo's compiler reads the file.
         """
-        robot = cls._from_chain(read_mjcf(path), {}, _check_tips(tip, tips), locked, tool, base, gravity)
+        robot = cls._from_chain(*read_mjcf(path, locked), _check_tips(tip, tips), locked, tool, base, gravity)
         # A compiled model has no file to read solids from later.
         if not isinstance(path, str | PathLike):
             return robot

@@ -19,7 +19,7 @@ import numpy as np
 import pinocchio as pin
 
 from orthocas.errors import RobotError, UnknownNameError, one_line
-from orthocas.robots.pinocchio_model import Mimic, collect_postures, fix_joints, set_position
+from orthocas.robots.pinocchio_model import Mimic, collect_postures, fix_joints, resolve_mimics, set_position
 from orthocas.tools.checks import Array
 from orthocas.tools.display import listed
 
@@ -388,20 +388,14 @@ def _read_mimics(model: pin.Model, root: ElementTree.Element) -> tuple[pin.Model
         RobotError: if joints follow each other in a loop.
     """
     # pin reads mimic joints as free ones, so the file is asked.
-    elements = {joint.get("name", ""): mimic for joint in root.findall("joint") for mimic in joint.findall("mimic")}
-    mimics = {}
-    for name in filter(model.existJointName, elements):
-        leader, factor, offset, passed = name, 1.0, 0.0, set[str]()
-        # Factors multiply, offsets add up.
-        while leader in elements:
-            if leader in passed:
-                raise RobotError(f"joint '{name}' mimics itself")
-            passed.add(leader)
-            mimic = elements[leader]
-            offset += factor * float(mimic.get("offset", 0))
-            factor *= float(mimic.get("multiplier", 1))
-            leader = mimic.get("joint", "")
-        mimics[name] = Mimic(leader, factor, offset)
+    direct = {
+        joint.get("name", ""): Mimic(
+            mimic.get("joint", ""), float(mimic.get("multiplier", 1)), float(mimic.get("offset", 0))
+        )
+        for joint in root.findall("joint")
+        for mimic in joint.findall("mimic")
+    }
+    mimics = {name: mimic for name, mimic in resolve_mimics(direct).items() if model.existJointName(name)}
     # those that never move
     fixed = {joint.get("name", "") for joint in root.findall("joint") if joint.get("type") == "fixed"}
     still = [name for name, mimic in mimics.items() if mimic.leader in fixed or not mimic.factor]

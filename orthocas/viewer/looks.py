@@ -74,6 +74,12 @@ class ViewRules:
     most_recorded: int = 100_000  #: joint positions, about an hour
     reading_pause: float = 0.1  #: between readings in a sweep, which take longer than a picture [s]
 
+    plot_points: int = 400  #: of a line in a plot
+    #: of the lines in a plot: eight that are told apart, also by the colour-blind (Okabe and Ito)
+    plot_colours: tuple[str, ...] = (
+        *("#0072b2", "#e69f00", "#009e73", "#cc79a7"),
+        *("#d55e00", "#56b4e9", "#000000", "#b8a800"),
+    )
     path_colours: tuple[Colour, ...] = ((31, 95, 168), (217, 95, 2), (27, 158, 119))
     path_points: int = 2000  #: of a tool path, at most
     apart: float = 0.9  #: distance of arms that are side by side

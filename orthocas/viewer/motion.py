@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +34,8 @@ class Motion:
     references: Array | None = None  #: (N, k)
     marked: NDArray[np.bool_] | None = None  #: (N,) where the controller used its fallback
     cycles: tuple[float, ...] = ()  #: ends of the cycles of a motion that repeats a path [s]
+    commands: Array | None = None  #: (N, n) of a controller
+    kind: str = "torque"  #: of the commands, or velocity
 
     def __post_init__(self) -> None:
         for name in ("times", "q", "values"):
@@ -41,7 +44,18 @@ class Motion:
     @classmethod
     def of_run(cls, run: Trajectory) -> "Motion":
         """The motion of a simulated run."""
-        return cls(run.controller, run.times, run.q, run.labels, run.value, run.reference, run.fell_back)
+        return cls(
+            run.controller,
+            run.times,
+            run.q,
+            run.labels,
+            run.value,
+            run.reference,
+            run.fell_back,
+            (),
+            run.command,
+            run.kind,
+        )
 
     @classmethod
     def of_path(cls, motion: JointMotion) -> "Motion":
@@ -171,23 +185,28 @@ def cyclic_motions(chart: Chart, path: Array | None = None, cycles: int = 3) -> 
 
 
 def _find_largest_circle(chart: Chart, start: Array, fractions: Array) -> tuple[Place, Array]:
-    """A circle in the first two components of the task, or a line in one, as large as the chart can follow."""
-    # Smaller and smaller circles, until the chart can follow one.
-    x0, m = chart.x(start), min(chart.m, 2)
-    radius = RULES.circle * float(chart.parts.phi_sizes[:m].min())
-    while True:
+    """A circle in two of the task's first three components, or a line in one, as large as the chart can follow."""
+    # Circles that begin at the start, on either side of it in each plane; smaller ones until the chart can follow one.
+    x0, sizes = chart.x(start), chart.parts.phi_sizes[: chart.m]
+    alike = [k for k in range(min(chart.m, 3)) if chart.problem.task.units[k] == chart.problem.task.units[0]]
+    sides = [(i, j, sign) for i in alike for j in alike if i != j for sign in (-1.0, 1.0)] or [(0, 0, 1.0)]
 
-        def along(fraction: Array, radius: float = radius) -> Array:
-            angle = 2 * np.pi * fraction
-            across = radius * np.stack([np.cos(angle) - 1, np.sin(angle)], axis=-1)
-            return x0 + np.pad(across[..., 2 - m :], ((0, 0), (0, chart.m - m)))
+    def place(radius: float, first: int, second: int, sign: float, fraction: Array) -> Array:
+        angle = 2 * np.pi * fraction
+        x = np.repeat(x0[None], len(fraction), axis=0)
+        x[:, first] += sign * radius * (np.cos(angle) - 1)
+        x[:, second] += radius * np.sin(angle) * (first != second)
+        return x
 
-        try:
-            return along, _follow_with_constant_xi(chart, along(fractions), start)
-        except PathError:
-            radius /= 1.3
-            if radius < RULES.smallest_circle * float(chart.parts.phi_sizes[:m].min()):
-                raise
+    largest = RULES.circle * float(sizes[alike].min())
+    for radius in largest / 1.3 ** np.arange(np.log(RULES.circle / RULES.smallest_circle) / np.log(1.3) + 1):
+        for side in sides:
+            along = partial(place, radius, *side)
+            try:
+                return along, _follow_with_constant_xi(chart, along(fractions), start)
+            except PathError as error:
+                last = error
+    raise last
 
 
 def _build_polygon(chart: Chart, path: Array) -> Place:

@@ -1,6 +1,6 @@
 """Readings of a joint position as a small page of HTML: numbers and bars."""
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from itertools import takewhile
@@ -283,7 +283,8 @@ def format_row(label: str, value: float, note: str = "") -> str:
 class PlayerPanel:
     """Writes where motions are: quantities of one motion, or how far the joints of several are from their start."""
 
-    def __init__(self, robot: Robot, motions: Sequence[Motion]) -> None:
+    def __init__(self, robot: Robot, motions: Sequence[Motion], units: Mapping[str, str] | None = None) -> None:
+        self._units = units or {}
         endless = np.full(robot.n, np.inf)
         self._motions = motions
         self._prismatic = np.array(robot.tree.prismatic)
@@ -305,7 +306,8 @@ class PlayerPanel:
         rows = []
         for i, label in enumerate(motion.labels):
             note = "" if motion.references is None else f"reference {motion.references[k, i]:.4f}"
-            rows.append(format_row(label, float(motion.values[k, i]), note))
+            name = f"{label} [{self._units[label]}]" if label in self._units else label
+            rows.append(format_row(name, float(motion.values[k, i]), note))
         marked = motion.marked is not None and motion.marked[k]
         stop = '<div class="stop">the controller uses its fallback</div>' if marked else ""
         head = f'<div class="name">{escape(motion.name)}</div>'

@@ -1,6 +1,6 @@
 """Pages without a chart: motions with a time slider, sliders for the joints of a robot, and pages in one file."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from functools import partial
 from typing import Any
 
@@ -68,10 +68,12 @@ class Stage:
 class PlayerPage:
     """The page of motions on a viser server."""
 
-    def __init__(self, server: Any, robot: Robot, look: Look, motions: Sequence[Motion]) -> None:
+    def __init__(
+        self, server: Any, robot: Robot, look: Look, motions: Sequence[Motion], units: Mapping[str, str] | None = None
+    ) -> None:
         self._server = server
         self._stage = Stage(server.scene, robot, look, motions)
-        self._panel = PlayerPanel(robot, motions)
+        self._panel = PlayerPanel(robot, motions, units or {})
         self._loop = Loop(lambda: None, self._show_failure)
         self._now = 0.0
         place_scene(server, robot, np.concatenate([pick_few(motion.q) for motion in motions]), self._stage.shifts)
@@ -85,12 +87,41 @@ class PlayerPage:
         self._again = gui.add_checkbox("repeat", initial_value=True)
         self._play.on_click(self._loop.build_handler("play", self._toggle))
         self._time.on_update(self._slide)
+        if len(motions) == 1 and motions[0].commands is not None:
+            self._plot_commands(robot, motions[0])
         self._show(0.0)
         self._loop.start()
 
     def close(self) -> None:
         """End the thread of the page."""
         self._loop.stop()
+
+    def _plot_commands(self, robot: Robot, motion: Motion) -> None:
+        """What the controller commanded over time: a plot for the revolute and one for the prismatic joints."""
+        from viser import uplot  # only runs have plots
+
+        assert motion.commands is not None
+        rows = np.unique(np.linspace(0, len(motion.times) - 1, RULES.plot_points).astype(int))
+        times = motion.times[rows] - motion.times[0]
+        units = {"torque": ("N m", "N"), "velocity": ("rad/s", "m/s")}[motion.kind]
+        for prismatic, unit in zip((False, True), units, strict=True):
+            chosen = [k for k, kind in enumerate(robot.tree.prismatic) if kind == prismatic]
+            if not chosen:
+                continue
+            lines = [
+                uplot.Series(
+                    label=robot.joint_names[k], stroke=RULES.plot_colours[i % len(RULES.plot_colours)], width=1
+                )
+                for i, k in enumerate(chosen)
+            ]
+            self._server.gui.add_uplot(
+                (times, *(np.ascontiguousarray(motion.commands[rows, k]) for k in chosen)),
+                (uplot.Series(label="s"), *lines),
+                title=f"command [{unit}]",
+                scales={"x": uplot.Scale(time=False, auto=True), "y": uplot.Scale(auto=True)},
+                legend=uplot.Legend(show=True),
+                aspect=1.2,
+            )
 
     async def _slide(self, event: Any) -> None:
         # Otherwise the page itself moved it.
@@ -224,7 +255,7 @@ def record_scene(build: Scene) -> str:
         for t in np.linspace(0.0, duration, round(RULES.rate * duration) + 1)[: None if duration else 0]:
             show(float(t))
             serializer.insert_sleep(1 / RULES.rate)
-        return build_page(str(serializer.as_html()).encode()).decode()
+        return build_page(str(serializer.as_html()).encode(), "motion").decode()
     finally:
         close_window(server)
 

@@ -17,6 +17,7 @@ from orthocas.errors import ArchiveError, InvalidValueError, NoExpressionError
 from orthocas.paths.joint_motion import JointMotion
 from orthocas.robots.collisions import Collisions
 from orthocas.robots.robot import Robot
+from orthocas.simulation.figure import units_of
 from orthocas.simulation.trajectory import Trajectory
 from orthocas.tools.checks import as_path, as_point_set, require_kind, suggest_attribute
 from orthocas.tools.files import publish, require_replaceable, require_writable
@@ -122,7 +123,9 @@ def view(
     try:
         page: ChartPage | RobotPage | PlayerPage
         if motions:
-            page = PlayerPage(server, arm, shape.look, motions)
+            page = PlayerPage(
+                server, arm, shape.look, motions, units_of(robot.problem) if isinstance(robot, Chart) else {}
+            )
         elif isinstance(shown, Chart):
             page = ChartPage(server, Session(shown), shape.look, collisions, points)
         else:

@@ -17,6 +17,7 @@ from collections.abc import Awaitable, Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import MISSING, dataclass, field, fields, replace
 from functools import lru_cache
+from html import escape
 from http import HTTPStatus
 from importlib import import_module
 from math import isfinite
@@ -55,7 +56,7 @@ _log = logging.getLogger(__name__)
 connections = logging.getLogger(f"{__name__}.connections")
 _HOST = re.compile(r"(?P<name>\[[0-9a-f:.]+\]|[0-9a-z._-]+)(?::\d{1,5})?")
 LOCAL = "127.0.0.1"
-TITLES = ("<title>Viser</title>", "<title>orthocas</title>")  #: of the page: viser's and ours
+TITLES = ("<title>Viser</title>", "<title>{} - orthocas</title>")  #: of the page: viser's, and ours with a name
 _SCRIPT = Path(__file__).with_name("page.js")
 Job = Callable[[], None]
 Tick = Callable[[float], bool]  #: seconds since it began -> whether it goes on
@@ -276,6 +277,7 @@ class Guard:
     token: str = field(default_factory=lambda: secrets.token_urlsafe(16))
     seen: list[bool] = field(default_factory=list)  #: not empty once a server is guarded
     inbox: Inbox = field(default_factory=Inbox)  #: judges what comes through a websocket
+    title: str = "view"  #: what the page shows
 
     def admit(self, path: str, hosts: list[str], origins: list[str]) -> str | None:
         """The path of a request behind the token; None if the request is refused.
@@ -322,7 +324,7 @@ def is_local(host: str) -> bool:
 
 
 @contextmanager
-def guard_server(host: str) -> Iterator[Guard]:
+def guard_server(host: str, title: str) -> Iterator[Guard]:
     """Guard the server that viser starts within the block.
 
     viser has no option for that. It looks `serve` of the package websockets up when it starts, so another function
@@ -330,7 +332,7 @@ def guard_server(host: str) -> Iterator[Guard]:
 
     A later viser may start it in another way: then `Guard.seen` stays empty.
     """
-    guard, module = Guard(host), _import_server()
+    guard, module = Guard(host, title=title), _import_server()
     with _starting:
         serve = module.serve
         module.serve = _add_guard(serve, guard)
@@ -372,7 +374,7 @@ def _add_guard(serve: Callable[..., Any], guard: Guard) -> Callable[..., Any]:
                 text = b"Open the whole address that orthocas printed.\n"
                 fields = headers_of({"Content-Type": "text/plain", "Content-Length": str(len(text))})
                 return answer_of(HTTPStatus.FORBIDDEN, "Forbidden", fields, text)
-            return rename_page(process_request(connection, replace(request, path=path)))
+            return rename_page(process_request(connection, replace(request, path=path)), guard.title)
 
         limits = {"max_size": RULES.largest_message, "logger": connections, "create_connection": Attentive}
         return serve(guard.inbox.guard_handler(handler), *arguments, process_request=judge, **{**options, **limits})
@@ -380,11 +382,11 @@ def _add_guard(serve: Callable[..., Any], guard: Guard) -> Callable[..., Any]:
     return serve_guarded
 
 
-def rename_page(answer: Any) -> Any:
-    """An answer with viser's page, named after us; other answers stay as they are."""
+def rename_page(answer: Any, title: str) -> Any:
+    """An answer with viser's page under another title; other answers stay as they are."""
     if answer is None or "html" not in answer.headers.get("Content-Type", ""):
         return answer
-    body = build_page(answer.body, answer.headers.get("Content-Encoding") == "gzip")
+    body = build_page(answer.body, title, answer.headers.get("Content-Encoding") == "gzip")
     headers = answer.headers.copy()
     # Or there would be two.
     del headers["Content-Length"]
@@ -393,9 +395,10 @@ def rename_page(answer: Any) -> Any:
 
 
 @lru_cache(maxsize=2)
-def build_page(body: bytes, packed: bool = False) -> bytes:
-    """viser's page with our title and our script, before its own."""
-    page = (gzip.decompress(body) if packed else body).replace(TITLES[0].encode(), TITLES[1].encode(), 1)
+def build_page(body: bytes, title: str, packed: bool = False) -> bytes:
+    """viser's page with another title, and our script before its own."""
+    page = gzip.decompress(body) if packed else body
+    page = page.replace(TITLES[0].encode(), TITLES[1].format(escape(title)).encode(), 1)
     page = page.replace(b"<head>", b"<head><script>" + _SCRIPT.read_bytes() + b"</script>", 1)
     return gzip.compress(page) if packed else page
 
@@ -419,7 +422,7 @@ def open_window(host: str, port: int, title: str) -> tuple[Any, str]:
     package = viser()
     require_free(host, port)
     # viser starts its server with our guard before it, and announces itself.
-    with guard_server(host) as guard, contextlib.redirect_stdout(io.StringIO()):
+    with guard_server(host, title) as guard, contextlib.redirect_stdout(io.StringIO()):
         server = package.ViserServer(host=host, port=port, label=title, verbose=False)
     inputs = getattr(server.gui, "_gui_input_handle_from_uuid", None)
     if not guard.seen or inputs is None:

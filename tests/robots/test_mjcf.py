@@ -42,7 +42,7 @@ def assert_close(got: np.ndarray, want: np.ndarray) -> None:
 
 def assert_agrees(path: Path, states: int = 5) -> None:
     """Names, limits, mass matrix, bias, and the poses of all named bodies and sites."""
-    theirs, ours = mujoco.MjModel.from_xml_path(str(path)), read_mjcf(path)
+    theirs, ours = mujoco.MjModel.from_xml_path(str(path)), read_mjcf(path)[0]
     data = ours.createData()
     assert list(ours.names)[1:] == [theirs.joint(i).name or f"joint{i}" for i in range(theirs.njnt)]
     ranges = np.where(theirs.jnt_limited[:, None], theirs.jnt_range, [-np.inf, np.inf])
@@ -64,7 +64,7 @@ def assert_agrees(path: Path, states: int = 5) -> None:
 def test_robot_has_the_mass_matrix_bias_and_tip_pose_of_mujoco(name: str) -> None:
     path, tip = DATA / f"{name}.xml", TIPS[name]
     assert_agrees(path)
-    robot, theirs = oc.Robot.from_model(read_mjcf(path), tip), mujoco.MjModel.from_xml_path(str(path))
+    robot, theirs = oc.Robot.from_model(read_mjcf(path)[0], tip), mujoco.MjModel.from_xml_path(str(path))
     for q, dq in np.random.default_rng(3).uniform(-2, 2, (5, 2, robot.n)):
         state, M, bias = mujoco_dynamics(theirs, q, dq)
         there = state.body(tip) if name in ("joints", "corrected") else state.site(tip)
@@ -96,7 +96,7 @@ def test_included_arm_beside_free_bodies_has_the_dynamics_of_mujoco() -> None:
         assert_close(robot.bias(q, dq), bias[:6])
         assert_close(robot.tip_position(q), state.site("tool").xpos)
     with pytest.raises(RobotError, match="box.*FreeFlyer"):
-        oc.Robot.from_model(read_mjcf(path), "tool")
+        oc.Robot.from_model(read_mjcf(path)[0], "tool")
 
 
 def test_locked_joints_keep_armatures_and_masses_of_the_others() -> None:
@@ -116,7 +116,7 @@ def test_total_mass_scales_every_body(tmp_path: Path) -> None:
     theirs = mujoco.MjModel.from_xml_path(str(path))
     mujoco.mj_setTotalmass(theirs, 14.0)
     path.write_text(text.replace("<compiler ", '<compiler settotalmass="14" '))
-    ours = read_mjcf(path)
+    ours = read_mjcf(path)[0]
     q, dq = np.random.default_rng(2).uniform(-2, 2, (2, 4))
     assert_close(pin.nonLinearEffects(ours, ours.createData(), q, dq), mujoco_dynamics(theirs, q, dq)[2])
 
@@ -298,10 +298,10 @@ def test_last_site_is_the_default_tip_and_wrong_tips_list_bodies_and_sites(tmp_p
 def test_ball_joints_are_refused_unless_they_can_be_locked_off_the_chain(tmp_path: Path) -> None:
     path = write(tmp_path, '<body name="c"><joint name="neck" type="ball"/><geom size="0.1"/></body>')
     with pytest.raises(RobotError, match="neck.*Spherical"):
-        oc.Robot.from_model(read_mjcf(path), "b")
+        oc.Robot.from_model(read_mjcf(path)[0], "b")
     assert oc.Robot.from_mjcf(path, "b").joint_names == ("j",)
     with pytest.raises(RobotError, match="neck.*degrees of freedom"):
-        lock_joints(read_mjcf(path), {"neck": 0.5})
+        lock_joints(read_mjcf(path)[0], {"neck": 0.5})
 
 
 BOMB = '<!DOCTYPE m [<!ENTITY a "ha">' + "".join(
@@ -382,3 +382,39 @@ def test_names_in_other_encodings_than_utf_8_are_refused(tmp_path: Path) -> None
     (tmp_path / "arm.xml").write_text(text, encoding="iso-8859-1")
     with pytest.raises(RobotError, match=r"arm.xml has names that are not UTF-8"):
         oc.Robot.from_mjcf(tmp_path / "arm.xml")
+
+
+COUPLED = """<mujoco><compiler angle="radian"/><worldbody>
+<body><joint name="a" axis="0 0 1"/><geom type="capsule" fromto="0 0 0 0.4 0 0.1" size="0.03" mass="2"/>
+<body pos="0.4 0 0.1"><joint name="b" axis="0 1 0" ref="0.2"/>
+<geom type="capsule" fromto="0 0 0 0.3 0.1 0" size="0.03" mass="1"/>
+<body pos="0.3 0.1 0"><joint name="c" axis="0 1 0" ref="-0.1"/>
+<geom type="capsule" fromto="0 0 0 0.2 0 0.1" size="0.03" mass="0.5"/>
+<body name="four" pos="0.2 0 0.1"><joint name="d" axis="1 0 0"/>
+<geom type="box" size="0.05 0.03 0.02" pos="0.05 0 0.02" mass="0.3"/></body></body></body></body></worldbody>
+<equality><joint joint1="c" joint2="b" polycoef="{coefficients}" active="{active}"/></equality></mujoco>"""
+
+
+def test_linear_couplings_of_joints_are_mimic_joints(tmp_path: Path) -> None:
+    """Mass matrix and bias are S^T M S and S^T b of MuJoCo's own, at joints that satisfy its constraint."""
+    path = tmp_path / "coupled.xml"
+    path.write_text(COUPLED.format(coefficients="0.05 -0.5 0 0 0", active="true"))
+    robot, theirs = oc.Robot.from_mjcf(path, "four"), mujoco.MjModel.from_xml_path(str(path))
+    assert robot.joint_names == ("a", "b", "d")
+    S = np.array([[1.0, 0, 0], [0, 1, 0], [0, -0.5, 0], [0, 0, 1]])
+    for q, dq in np.random.default_rng(3).uniform(-1, 1, (5, 2, 3)):
+        state, M, bias = mujoco_dynamics(theirs, S @ q + [0, 0, -0.1 + 0.05 + 0.5 * 0.2, 0], S @ dq)
+        assert abs(state.efc_pos[0]) < 1e-12  # MuJoCo's own constraint holds
+        assert_close(robot.mass_matrix(q), S.T @ M @ S)
+        assert_close(robot.bias(q, dq), S.T @ bias)
+        assert_close(robot.tip_position(q), state.body("four").xpos)
+    # A joint that is locked follows no more.
+    assert oc.Robot.from_mjcf(path, "four", {"c": 0.3}).joint_names == ("a", "b", "d")
+    assert oc.Robot.from_mjcf(path, "four", {"c": 0.3}).mimics == ()
+
+
+@pytest.mark.parametrize(("coefficients", "active"), [("0 1 0.2 0 0", "true"), ("0 1 0 0 0", "false")])
+def test_other_equalities_leave_joints_free(coefficients: str, active: str, tmp_path: Path) -> None:
+    path = tmp_path / "free.xml"
+    path.write_text(COUPLED.format(coefficients=coefficients, active=active))
+    assert oc.Robot.from_mjcf(path, "four").joint_names == ("a", "b", "c", "d")

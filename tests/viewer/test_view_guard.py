@@ -146,7 +146,7 @@ def test_pages_are_served_to_those_with_the_address_only(view: View) -> None:
     parts = urlsplit(view.url)
     assert status(view.url, parts.path) == 200
     for packed in ("identity", "gzip"):
-        assert title(view.url, packed) == "orthocas"
+        assert title(view.url, packed) == "tip - orthocas"
     assert status(view.url, f"{parts.path}/?fixedDpr=0.3", Origin=f"http://{parts.netloc}") == 200
     assert status(view.url, parts.path, Host=f"localhost:{parts.port}") == 200
     assert status(view.url, "/") == 403
@@ -237,7 +237,7 @@ def test_pages_of_others_in_a_real_browser_get_no_websocket(view: View, tmp_path
         page.open(view.url)  # the same script in the page's own origin, and the page itself
         page.wait("!!document.querySelector('canvas')")
         assert page.value(code) == "in"
-        assert page.value("document.title") == "orthocas"
+        assert page.value("document.title").endswith(" - orthocas")
         page.open(page.value("location.href"))  # viser adds to the address; it stays one that can be opened
         page.wait("!!document.querySelector('canvas')")
         evil.shutdown()

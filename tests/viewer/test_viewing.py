@@ -20,6 +20,7 @@ from orthocas.errors import InvalidValueError, MissingExtraError, NoExpressionEr
 from orthocas.tools import checks
 from orthocas.viewer import Motion, export_page, window
 from orthocas.viewer.panel import ChartPanel, PlayerPanel, RobotPanel, format_drift
+from orthocas.viewer.player import PlayerPage
 from orthocas.viewer.session import Session
 from orthocas.viewer.window import Loop, is_local
 
@@ -51,6 +52,32 @@ def test_panels_hold_the_numbers_and_escape_names() -> None:
     assert float(shown["conditioning"]) == float(quality.conditioning)
     assert float(shown["xi1"]) == quality.leak_deg[0]
     assert float(shown["boundary"]) == float(quality.boundary_distance)
+
+
+class Plots:
+    """A server whose plots can be looked at."""
+
+    def __init__(self) -> None:
+        self.gui, self.drawn = self, []  # type: ignore[var-annotated]
+
+    def add_uplot(self, data, series, **words) -> None:  # type: ignore[no-untyped-def]
+        self.drawn.append((data, [line["label"] for line in series], words["title"]))
+
+
+def test_pages_of_runs_plot_commands_and_have_units() -> None:
+    run, robot = trajectory(), oc.problems.get("planar_3r_xy").robot
+    motion = Motion.of_run(run)
+    page, server = object.__new__(PlayerPage), Plots()
+    page._server = server
+    page._plot_commands(robot, motion)
+    ((data, labels, title),) = server.drawn
+    assert (labels[1:], title) == (
+        list(robot.joint_names),
+        "command [N m]" if run.kind == "torque" else "command [rad/s]",
+    )
+    for k, drawn in enumerate(data[1:]):
+        np.testing.assert_array_equal(drawn, np.interp(data[0], run.times - run.times[0], run.command[:, k]))
+    assert f">{run.labels[0]} [m]<" in PlayerPanel(robot, [motion], {run.labels[0]: "m"}).format_html(0.0)
 
 
 def test_panels_of_one_coordinate_show_what_holding_it_takes() -> None:

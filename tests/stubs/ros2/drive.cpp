@@ -12,6 +12,7 @@ namespace rclcpp {
 void log_with_format(const Logger &, const char *format, ...) {
   va_list arguments;
   va_start(arguments, format);
+  ++warnings;
   std::vfprintf(stderr, format, arguments);
   va_end(arguments);
 }
@@ -19,6 +20,7 @@ void log_with_format(const Logger &, const char *format, ...) {
 
 namespace {
 constexpr int N = ARM_JOINTS;
+using arm_controller::msg::Target;
 using rclcpp_lifecycle::made;
 std::array<double, N> q, dq, seen, torque, felt;
 
@@ -47,7 +49,7 @@ int run(arm_controller::ArmController &controller, int ticks, bool blind = false
   for (int tick = 0; tick < ticks; ++tick) {
     seen = q;
     if (blind) seen[2] = std::numeric_limits<double>::quiet_NaN();
-    if (controller.update({}, rclcpp::Duration(0.001)) != controller_interface::return_type::OK) return -1;
+    if (controller.update(rclcpp::Time(), rclcpp::Duration(0.001)) != controller_interface::return_type::OK) return -1;
     move_arm();
   }
   made<rclcpp::TimerBase>->callback();
@@ -74,11 +76,16 @@ int main() {
   }
   seen = q;
   if (controller.on_init() != controller_interface::CallbackReturn::SUCCESS) return 1;
-  controller.get_node()->parameters["smoothness"].number = 3.0;
-  controller.get_node()->parameters["effort_states"].number = 1.0;
-  controller.get_node()->parameters["joints"] = {};
-  std::printf("without joints %d\n", controller.on_configure({}) == controller_interface::CallbackReturn::ERROR);
-  controller.get_node()->parameters["joints"].names = {"A1", "A2", "A3", "A4", "A5", "A6", "A7"};
+  auto &parameters = arm_controller::set_params;
+  parameters.effort_states = true;
+  parameters.frame = "base";
+  const auto refused = [&] { return controller.on_configure({}) == controller_interface::CallbackReturn::ERROR; };
+  parameters.joints = {"A1", "A2"};
+  std::printf("two joints refused %d\n", refused());
+  parameters.joints = {"A7", "A2", "A3", "A4", "A5", "A6", "A1"};  // in any order: they are those of arm.h
+  parameters.command = "position";
+  std::printf("torques as positions refused %d\n", refused());
+  parameters.command = "";
   if (controller.on_configure({}) != controller_interface::CallbackReturn::SUCCESS) return 1;
   std::printf("first command %s\n", controller.command_interface_configuration().names.front().c_str());
   std::printf("last state %s\n", controller.state_interface_configuration().names.back().c_str());
@@ -97,30 +104,61 @@ int main() {
   };
   std::printf("nothing to resume %d\n", !resume());
 
-  auto target = std::make_shared<std_msgs::msg::Float64MultiArray>();
+  auto target = std::make_shared<Target>();
   arm_reference reference;
-  arm_reference_at(q.data(), &reference);
-  target->data.assign(reference.value, reference.value + ARM_REFERENCE);
   const double start = first_extra();
-  target->data[ARM_TASK] += 0.1;
-  made<rclcpp::Subscription<std_msgs::msg::Float64MultiArray>>->callback(target);
+  target->header.frame_id = "base";
+  target->header.stamp = controller.get_node()->now();
+  target->names = {"xi1"};
+  target->values = {start + 0.1};
+  const auto send = [](const Target &message) {
+    const int before = rclcpp::warnings;
+    made<rclcpp::Subscription<Target>>->callback(std::make_shared<Target>(message));
+    return rclcpp::warnings == before;  // accepted
+  };
+  std::printf("target %d\n", send(*target));
   std::printf("moved %d\n", run(controller, 4000));
   std::printf("moved by %.6f\n", first_extra() - start);
 
-  auto spoiled = std::make_shared<std_msgs::msg::Float64MultiArray>(*target);
-  spoiled->data[ARM_TASK] = std::numeric_limits<double>::quiet_NaN();
-  made<rclcpp::Subscription<std_msgs::msg::Float64MultiArray>>->callback(spoiled);
-  std::printf("spoiled target %d\n", run(controller, 500));
+  // Refused: NaN, an unknown or doubled name, too few values, another frame, an old stamp.
+  const auto spoil = [&](auto change) {
+    Target other = *target;
+    other.values[0] = start;
+    change(other);
+    return !send(other);
+  };
+  std::printf("NaN refused %d\n", spoil([](Target &other) { other.values[0] = std::nan(""); }));
+  std::printf("unknown name refused %d\n", spoil([](Target &other) { other.names[0] = "xi9"; }));
+  std::printf("double name refused %d\n", spoil([](Target &other) { other.names = {"xi1", "xi1"}, other.values = {0, 0}; }));
+  std::printf("too few refused %d\n", spoil([](Target &other) { other.names.clear(); }));
+  std::printf("other frame refused %d\n", spoil([](Target &other) { other.header.frame_id = "camera"; }));
+  controller.get_node()->clock += 0.6;
+  std::printf("old target refused %d\n", spoil([](Target &) {}));
+  parameters.target_age = 0.0;
+  parameters.__stamp = rclcpp::Time(1.0);
+  std::printf("spoiled targets %d\n", run(controller, 500));
   std::printf("still moved by %.6f\n", first_extra() - start);
-  target->data[ARM_TASK] -= 0.05;
-  made<rclcpp::Subscription<std_msgs::msg::Float64MultiArray>>->callback(target);
+  // Its age does not matter any more; two messages between two ticks, each with a name of its own.
+  target->values = {start + 0.05};
+  std::printf("old target now %d\n", send(*target));
+  arm_reference_at(q.data(), &reference);
+  target->names = {"z"};
+  target->values = {reference.value[2] + 0.01};
+  std::printf("two names %d\n", send(*target));
+  const double height = reference.value[2];
   std::printf("moved again %d\n", run(controller, 4000));
   std::printf("now moved by %.6f\n", first_extra() - start);
+  arm_reference_at(q.data(), &reference);
+  std::printf("risen by %.6f\n", reference.value[2] - height);
 
   std::printf("blind %d\n", run(controller, 50, true));
   std::printf("seeing again %d\n", run(controller, 500));
+  const auto &diagnosed = made<rclcpp::Publisher<diagnostic_msgs::msg::DiagnosticArray>>->last.status.front();
+  std::printf("level %d\n", diagnosed.level);
+  std::printf("diagnosis: %s 0\n", diagnosed.message.c_str());
   if (controller.on_deactivate({}) != controller_interface::CallbackReturn::SUCCESS) return 1;
   std::printf("refused without a controller %d\n", !resume());
+  std::printf("target without a controller refused %d\n", !send(*target));
   if (controller.on_activate({}) != controller_interface::CallbackReturn::SUCCESS) return 1;
   std::printf("held again %d\n", run(controller, 500));
   std::printf("blind again %d\n", run(controller, 50, true));
@@ -137,7 +175,8 @@ int main() {
   made<rclcpp::Service<std_srvs::srv::SetBool>>->callback(closed, answer);
   std::printf("brakes open %d\n", run(controller, 100));
   arm_reference_at(q.data(), &reference);
-  const auto &present = made<rclcpp::Publisher<std_msgs::msg::Float64MultiArray>>->last.data;
-  std::printf("present off by %.6f\n", std::fabs(present[ARM_TASK] - reference.value[ARM_TASK]));
+  const Target &present = made<rclcpp::Publisher<Target>>->last;
+  std::printf("present off by %.6f\n", std::fabs(present.values[ARM_TASK] - reference.value[ARM_TASK]));
+  std::printf("present %s %s 0\n", present.header.frame_id.c_str(), present.names[ARM_TASK].c_str());
   return 0;
 }

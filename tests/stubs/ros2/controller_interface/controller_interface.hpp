@@ -29,10 +29,6 @@ class ControllerInterface {
   virtual CallbackReturn on_deactivate(const rclcpp_lifecycle::State &previous_state) = 0;
   virtual return_type update(const rclcpp::Time &time, const rclcpp::Duration &period) = 0;
   std::shared_ptr<rclcpp_lifecycle::LifecycleNode> get_node() const { return node_; }
-  template <typename T>
-  T auto_declare(const std::string & /*name*/, const T &default_value) {
-    return default_value;
-  }
   void assign_interfaces(std::vector<hardware_interface::LoanedCommandInterface> &&command_interfaces,
                          std::vector<hardware_interface::LoanedStateInterface> &&state_interfaces) {
     command_interfaces_ = command_interfaces;

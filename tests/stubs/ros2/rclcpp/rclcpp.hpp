@@ -1,11 +1,15 @@
 #pragma once
+#include <cmath>
 #include <functional>
 #include <memory>
 #include <string>
 #include <vector>
 
+#include "builtin_interfaces/msg/time.hpp"
+
+enum rcl_clock_type_t { RCL_CLOCK_UNINITIALIZED = 0, RCL_ROS_TIME, RCL_SYSTEM_TIME, RCL_STEADY_TIME };
+
 namespace rclcpp {
-class Time {};
 class Duration {
  public:
   explicit Duration(double seconds) : seconds_(seconds) {}
@@ -14,15 +18,26 @@ class Duration {
  private:
   double seconds_;
 };
+class Time {
+ public:
+  explicit Time(double seconds = 0.0) : seconds_(seconds) {}
+  Time(const builtin_interfaces::msg::Time &stamp, rcl_clock_type_t /*clock_type*/ = RCL_ROS_TIME)
+      : seconds_(stamp.sec + 1e-9 * stamp.nanosec) {}
+  operator builtin_interfaces::msg::Time() const {
+    builtin_interfaces::msg::Time stamp;
+    stamp.sec = static_cast<std::int32_t>(seconds_);
+    stamp.nanosec = static_cast<std::uint32_t>(1e9 * (seconds_ - stamp.sec));
+    return stamp;
+  }
+  rcl_clock_type_t get_clock_type() const { return RCL_ROS_TIME; }
+  Duration operator-(const Time &other) const { return Duration(seconds_ - other.seconds_); }
+  bool operator!=(const Time &other) const { return seconds_ != other.seconds_; }
+
+ private:
+  double seconds_;
+};
 class Logger {};
 class SystemDefaultsQoS {};
-struct Parameter {
-  std::vector<std::string> names;
-  double number = 0.0;
-  std::vector<std::string> as_string_array() const { return names; }
-  double as_double() const { return number; }
-  bool as_bool() const { return number != 0.0; }
-};
 template <typename M>
 struct Subscription {
   using SharedPtr = std::shared_ptr<Subscription>;
@@ -43,6 +58,7 @@ struct TimerBase {
   using SharedPtr = std::shared_ptr<TimerBase>;
   std::function<void()> callback;
 };
+inline int warnings = 0;  // and errors, logged so far
 void log_with_format(const Logger &logger, const char *format, ...) __attribute__((format(printf, 2, 3)));
 }  // namespace rclcpp
 #define RCLCPP_ERROR(logger, ...) ::rclcpp::log_with_format(logger, __VA_ARGS__)
