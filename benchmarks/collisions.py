@@ -24,7 +24,7 @@ from scipy.spatial import ConvexHull
 
 import orthocas as oc
 from orthocas.charts.trackers import TrackerStatus
-from orthocas.codegen.library import find_compilers
+from orthocas.native.libraries import find_compilers
 from orthocas.robots.capsules import FittedCapsules
 from orthocas.robots.collisions import Collisions
 from orthocas.robots.kinematics import build_body_poses

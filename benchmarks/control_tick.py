@@ -16,8 +16,8 @@ from benchmark import run
 import orthocas as oc
 from orthocas import problems
 from orthocas.codegen import CompiledLibrary, compile_shared, time_ticks
-from orthocas.codegen.library import find_compilers
 from orthocas.control import Controller, Impedance, Kinematic, PDPlus
+from orthocas.native.libraries import find_compilers
 
 _PLAIN = """
 int plain_control(const double *q, const double *dq, const double *reference, const double *gains, double *command) {

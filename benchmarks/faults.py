@@ -42,6 +42,7 @@ ARMS = ("iiwa7-position", "panda-position", "xarm7-position", "tiago-pro-left-po
 RUNS, TICK, SETTLED = 5, 1e-3, 400
 LOOK = 200  # ticks after sensors stand still
 REST = 0.05  # [rad/s]
+HEAVIER = 1.2  # masses of an arm that the model does not know
 OBSERVED = 12, 13, 14  # bits of encoders
 TRAVEL = 0.05  # of a sliding joint in a turn of its encoder [m]
 PUSH = 50.0, 500, 600  # [N], from and to a tick
@@ -79,11 +80,11 @@ class Arm:
         return self.safety.speed_limit
 
     def posture(self, share: float = 0.5) -> Array:
-        """Within a share of the domain, and of 1.5 rad around its centre, (n,)."""
-        domain = self.chart.problem.domain
+        """Within a share of the domain, and of 1.5 rad around its centre, where motors hold 20 % more, (n,)."""
+        domain, robot = self.chart.problem.domain, self.robot
         while True:
             q = domain.centre + share * np.minimum(domain.half_width, 1.5) * self.rng.uniform(-1, 1, self.chart.n)
-            if domain.contains(q):
+            if domain.contains(q) and (HEAVIER * np.abs(robot.gravity(q)) <= robot.effort_limits).all():
                 return q
 
     def resting(self, q: Array) -> Array:
@@ -254,10 +255,13 @@ def stands_still(arm: Arm, case: str) -> tuple[float, float]:
     wrong = case == "integral"
     q, domain = arm.posture(), arm.chart.problem.domain
     if case == "way back":
-        q[1] = domain.centre[1] + 1.25 * min(domain.half_width[1], 2.0)
+        # Outside a tight domain, but within the joint's stops.
+        q[1] = min(
+            domain.centre[1] + 1.25 * min(domain.half_width[1], 2.0), arm.safety.upper[1] - arm.safety.stop_zone[1]
+        )
     supervisor, plant = arm.started(
         q,
-        arm.robot.with_scaled_masses(1.2) if wrong else None,
+        arm.robot.with_scaled_masses(HEAVIER) if wrong else None,
         integral_rate=np.full(arm.chart.n, 3.0 if wrong else 0.0),
     )
     reference, signs, most = arm.resting(q), arm.rng.choice([-1.0, 1.0], arm.chart.n), np.zeros(arm.chart.n)

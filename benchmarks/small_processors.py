@@ -21,8 +21,9 @@ from benchmark import run, table
 
 import orthocas as oc
 from orthocas.codegen import GeneratedC
-from orthocas.codegen.rendering import DOUBLE, SINGLE, write_numbers
+from orthocas.codegen.rendering import DOUBLE, SINGLE
 from orthocas.control import PDPlus
+from orthocas.native.rendering import write_numbers
 from orthocas.tools.checks import Array
 
 TOOLS = ("arm-none-eabi-gcc", "qemu-system-arm")

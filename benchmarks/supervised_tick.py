@@ -17,8 +17,8 @@ from benchmark import run
 import orthocas as oc
 from orthocas import problems
 from orthocas.codegen import CompiledLibrary, Supervisor, check_c, compile_shared, time_ticks
-from orthocas.codegen.library import find_compilers
 from orthocas.control import PDPlus
+from orthocas.native.libraries import find_compilers
 from orthocas.simulation import MuJoCoPlant
 
 TICK = 1e-3

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import warnings
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -312,9 +313,8 @@ class Arm(Shown):
                 nearest xi (NEAREST), or without xi that nearest to the start, or farthest from limits. Where none is
                 free, the status is COLLIDING.
             all: return the postures with one task value in which the chart of their branch has one xi, those without a
-                contact first, the others COLLIDING. They are sought between places 0.05 rad apart on the arcs, so
-                that some are missed where less of an arc lies in the domain, or where xi turns back in between. Without
-                xi, postures are the arcs of `self_motion`.
+                contact first, the others COLLIDING. They are sought between places 0.05 rad apart on the arcs, also
+                where xi turns back once in between. Without xi, postures are the arcs of `self_motion`.
 
         Raises:
             InvalidValueError, ShapeError: for arguments that do not fit, an xi or branch without charts, or all without
@@ -682,15 +682,25 @@ class Arm(Shown):
                 shift: Array = 2 * np.pi * np.array(turns, dtype=float)
                 q = along + shift
                 near = np.flatnonzero(((q >= low - RULES.spacing) & (q <= high + RULES.spacing)).all(axis=1))
-                inside, left = np.zeros(len(q), dtype=bool), np.full(len(q), np.nan)
+                left = np.full(len(q), np.nan)
                 if near.size:
-                    inside[near], left[near] = np.asarray(domain.contains(q[near])), miss(q[near])
+                    left[near] = miss(q[near])
                 # A change of sign between two places has a posture with this xi, unless xi jumps by its period there.
-                crosses = (left[:-1] * left[1:] <= 0) & (inside[:-1] | inside[1:])
+                # Only that posture need lie in the domain, of which the arc may pass a short part.
+                crosses = left[:-1] * left[1:] <= 0
                 if period:
                     crosses &= np.abs(left[1:] - left[:-1]) < period / 2
-                for row in np.flatnonzero(crosses):
-                    posture, error = _find_root(arc, shift, miss, *places[row : row + 2].tolist())
+                pairs = [places[row : row + 2].tolist() for row in np.flatnonzero(crosses)]
+                # Where xi turns back between two places, there may be one on both sides of the turn.
+                ahead, size = np.abs(np.diff(left)), np.abs(left)
+                dips = (left[:-2] * left[1:-1] > 0) & (left[2:] * left[1:-1] > 0) & (size[1:-1] <= size[:-2])
+                dips &= (size[1:-1] <= size[2:]) & (size[1:-1] <= np.maximum(ahead[:-1], ahead[1:]))
+                for row in np.flatnonzero(dips):
+                    begin, end = places[row], places[row + 2]
+                    turn = _find_turn(arc, shift, miss, begin, end, float(np.sign(left[row])))
+                    pairs += [] if turn is None else [[begin, turn], [turn, end]]
+                for begin, end in pairs:
+                    posture, error = _find_root(arc, shift, miss, begin, end)
                     known = any(np.abs(wrap_shortest(posture - other, periods)).max() < RULES.same for other in found)
                     if abs(error) < RULES.tolerance and not known and bool(domain.contains(posture)):
                         found.append(posture)
@@ -722,6 +732,23 @@ def _agree(chart: Chart, task: Task) -> bool:
     q = chart.problem.domain.home[None]
     same = chart.m == task.m and chart.n == task.robot.n
     return same and bool(np.allclose(chart.problem.task.batched(q)[0], task.batched(q)[0], rtol=0, atol=1e-9))
+
+
+def _find_turn(
+    arc: Arc, shift: Array, f: Callable[[Array], Array], low: float, high: float, sign: float
+) -> float | None:
+    """A place between two on an arc, shifted, where f has another sign than at both; None if there is none."""
+    ratio = (math.sqrt(5) - 1) / 2
+    for _ in range(RULES.steps):
+        pair = high - ratio * (high - low), low + ratio * (high - low)
+        first, second = (sign * f(arc.at(np.array(pair)) + shift)).tolist()
+        if min(first, second) < 0:
+            return pair[0] if first < second else pair[1]
+        low, high = (low, pair[1]) if first < second else (pair[0], high)
+        # What is left no longer falls.
+        if abs(first - second) < RULES.met:
+            break
+    return None
 
 
 def _find_root(arc: Arc, shift: Array, f: Callable[[Array], Array], low: float, high: float) -> tuple[Array, float]:

@@ -9,14 +9,14 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocas.arms.kernel import RULES as CURVES
 from orthocas.arms.kernel import build_curvature, write_curves
 from orthocas.arms.maps import ArmMaps
 from orthocas.charts.chart import Chart
-from orthocas.codegen.compiled import keep_library, load_library
-from orthocas.codegen.kernels import generate_kernels
-from orthocas.codegen.library import pointer
 from orthocas.codegen.rendering import render
+from orthocas.errors import InvalidValueError
+from orthocas.native.curves import RULES as CURVES
+from orthocas.native.kernels import generate_kernels
+from orthocas.native.libraries import keep_library, load_library, pointer
 from orthocas.tasks.regular_box import find_joint_range
 from orthocas.tools.batch import dense_function, run_in_threads
 from orthocas.tools.cached import cached_property
@@ -75,7 +75,7 @@ class ChartKernelRules:
     near_starts: int = 6  #: stored postures of a chart that a row tries before all curves of x are searched
     spacing: float = 0.05  #: between points of curves at which xi is looked at
     room: float = 0.05  #: beyond limits, within which a point between nodes may be inside
-    lifts: int = 32  #: combinations of full turns of joints that are looked at
+    lifts: int = 4096  #: combinations of full turns of joints, at most
     bisections: int = 30  #: between two of these points, at most
     halved: int = 3  #: of them, before Newton's method is tried
     curve_starts: int = CURVES.starts  #: of the search of all curves
@@ -312,7 +312,7 @@ def write_tracker(
         "places": len(maps.place_scale),
         "place_scale": maps.place_scale,
         "charts": parts,
-        "rules": asdict(RULES),
+        "rules": {name: value for name, value in asdict(RULES).items() if name != "lifts"},
         "curve_rules": asdict(CURVES),
         "low": robot.lower,
         "high": robot.upper,
@@ -335,5 +335,11 @@ def write_tracker(
         values["lift_low"] = np.where(endless, np.maximum(lows.min(axis=0), around[0]), robot.lower)
         values["lift_high"] = np.where(endless, np.minimum(highs.max(axis=0), around[1]), robot.upper)
         values["winds"] = winds
+        # All combinations of full turns find room, so that none is dropped.
+        ranges = np.where(maps.turning, values["lift_high"] - values["lift_low"] + 2 * RULES.room, 0.0)
+        lifts = np.prod(np.floor(ranges[np.isfinite(ranges)] / (2 * np.pi)) + 1)
+        if lifts > RULES.lifts:
+            raise InvalidValueError("limits", f"{lifts:.0f} combinations of full turns", f"at most {RULES.lifts}")
+        values["lifts"] = int(lifts)
     source = f"{name}_track.c" if template == "arm_track.c" else f"{name}.c"
     return {f"{name}_track.h": render("arm_track.h", values), source: render(template, values)}

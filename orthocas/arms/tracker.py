@@ -11,8 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthocas.arms.chart_kernel import RULES, ChartKernel, tracker_type
 from orthocas.charts.clearance import Clearance
-from orthocas.codegen.library import pointer
 from orthocas.errors import InvalidValueError, degrees_hint
+from orthocas.native.libraries import pointer
 from orthocas.tools.checks import Array, as_float_array, as_number, as_point, require_kind, require_shape
 from orthocas.tools.display import Shown, number_list
 

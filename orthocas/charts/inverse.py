@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field, replace
 from enum import IntEnum
@@ -47,6 +48,7 @@ class InverseRules:
     restarts: int = 8  #: from points of the table, where nothing leads to any solution
     snap: float = 1e-9  #: half-widths: solutions so close to the boundary are moved onto it
     slack: float = 1e-9  #: half-widths: joint limits are decimal numbers, see `require_within_limits`
+    turned: float = 3 * math.pi  #: [rad] from the centre, of joints whose full turns change xi: of all solutions
     same: float = 1e-6  #: half-widths up to which two solutions count as one
     named: int = 5  #: rows that a message names
 
@@ -246,9 +248,12 @@ def solve_all(chart: Chart, phi: Array, tolerance: float, collisions: Collisions
     near = (search.brief or search.local)(np.broadcast_to(phi, starts.shape), starts)
     solved = near.q[largest(near.residual) <= tolerance]
     every = np.concatenate([solved[domain.contains(solved)], whole.find_all(phi, near.q, float(tolerance))])
+    # where full turns change xi, solutions have no end: those within one and a half turns of the centre
+    away = np.where(chart.parts.boxed.winding, np.abs(every - domain.home), 0.0)
+    every = every[np.asarray((away <= RULES.turned).all(axis=1))]
     # of all that are found, those that differ by more than full turns, the nearest to the centre first
-    turns = np.zeros(chart.n)
-    turns[list(chart.problem.turning)] = 2 * np.pi
+    endless = np.isinf(domain.bounds[0]) & ~np.array(chart.problem.robot.tree.prismatic)
+    turns = np.where(endless, 2 * np.pi, 0.0)
     kept: list[int] = []
     for k in np.argsort(np.linalg.norm((every - domain.centre) / domain.half_width, axis=1)):
         apart = np.abs(wrap_shortest(every[k] - every[kept], turns)) / domain.half_width

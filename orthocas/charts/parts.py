@@ -15,6 +15,7 @@ from orthocas.charts.curves import SelfMotionCurves
 from orthocas.charts.descent import RULES, BoxedPhi
 from orthocas.charts.inside import Inside
 from orthocas.charts.inverse import Inverse
+from orthocas.charts.motion_kernel import MotionKernel, find_kernel
 from orthocas.charts.newton import (
     NEWTON,
     Continuation,
@@ -170,6 +171,11 @@ class ChartParts:
     def tracer(self) -> CurveTracer:
         """Traces self-motion curves, r = 1."""
         return CurveTracer(self.boxed)
+
+    @cached_property
+    def motion_kernel(self) -> MotionKernel | None:
+        """Follows self-motions in C, r = 1; None where Python does."""
+        return find_kernel(self.chart)
 
     @cached_property
     def turn_shifts(self) -> dict[str, Array]:

@@ -12,6 +12,7 @@ import scipy
 from numpy.typing import ArrayLike
 
 from orthocas.charts.curve_tracer import solutions_of
+from orthocas.charts.motion_kernel import ENDLESS, FOLD, SINGULAR, WALL
 from orthocas.charts.newton import Newton
 from orthocas.charts.phi import counted_on, largest, require_no_turns
 from orthocas.errors import InvalidValueError, degrees_hint
@@ -59,10 +60,10 @@ def xi_range(chart: Chart, q: ArrayLike, collisions: Collisions | None = None) -
     start, intervals = start_inside(chart, q, collisions), []
     for k in range(chart.r):
         # the curve on which only this coordinate changes, both ways
-        down, up = (branch_along(chart, start, k, sign, collisions) for sign in (-1.0, 1.0))
-        low, high = (float(xi_along(chart, branch.q)[-1, k]) for branch in (down, up))
+        down, up = (branch_along(chart, start, k, sign, collisions) for sign in (-1, 1))
+        low, high = (float(counted_on(branch.xi, chart.parts.turns[chart.m :])[-1, k]) for branch in (down, up))
         ends = -np.inf if down.endless else low, np.inf if up.endless else high
-        here = float(chart.xi(start)[k])
+        here = float(up.xi[0, k])
         intervals.append(Interval(chart.labels[chart.m + k], here, *ends, down.stop, up.stop))
     return XiRange(tuple(intervals), chart.parts.turn_shifts)
 
@@ -103,14 +104,12 @@ def start_inside(chart: Chart, q: ArrayLike, collisions: Collisions | None = Non
 
 def _curve(chart: Chart, q: Array, step: float, collisions: Collisions | None) -> SelfMotionCurve:
     """Both directions of the curve; the coordinate rises at q."""
-    curve = LevelCurve(chart, np.arange(chart.m), step, collisions)
-    gradient = chart.parts.batched_rates(q[None])[0, chart.m]
+    up = branch_along(chart, q, 0, 1, collisions, step, folds=False)
     # a curve that closes is found in one direction
-    up = curve.follow(q, gradient)
-    down = Branch(q[None], np.zeros(1), up.stop) if up.endless else curve.follow(q, -gradient)
+    down = up.start if up.endless else branch_along(chart, q, 0, -1, collisions, step, folds=False)
     points = np.concatenate([down.q[:0:-1], up.q])
     # along the curve, xi may turn back, so its least and largest values need not be at the ends
-    xi = xi_along(chart, points)
+    xi = counted_on(np.concatenate([down.xi[:0:-1], up.xi]), chart.parts.turns[chart.m :])
     rises = np.sign(np.diff(xi[:, 0]))
     low, high = (down, up) if xi[0, 0] <= xi[-1, 0] else (up, down)
     place = len(down.q) - 1
@@ -142,9 +141,9 @@ def _widest(chart: Chart, points: Array, xi: Array, alone: Interval, k: int, col
     """The extent of one coordinate: from the outermost points of a set along the coordinate to what stops it."""
     if not np.isfinite([alone.low, alone.high]).all():
         return alone
-    down = branch_along(chart, points[np.argmin(xi[:, k])], k, -1.0, collisions)
-    up = branch_along(chart, points[np.argmax(xi[:, k])], k, 1.0, collisions)
-    low, high = (float(chart.xi(branch.q[-1])[k]) for branch in (down, up))
+    down = branch_along(chart, points[np.argmin(xi[:, k])], k, -1, collisions)
+    up = branch_along(chart, points[np.argmax(xi[:, k])], k, 1, collisions)
+    low, high = (float(branch.xi[-1, k]) for branch in (down, up))
     return Interval(alone.label, alone.here, low, high, down.stop, up.stop)
 
 
@@ -206,22 +205,47 @@ def _solved(chart: Chart, starts: Array, targets: Array, sign: float) -> tuple[A
     return found.q, np.asarray(rows[same], dtype=np.int64)
 
 
-def branch_along(chart: Chart, q: Array, k: int, sign: float, collisions: Collisions | None = None) -> Branch:
-    """The curve from q (n,) on which x and all coordinates but the k-th stay, and that one rises (sign 1) or falls."""
-    row = chart.m + k
-    curve = LevelCurve(chart, np.delete(np.arange(chart.n), row), RULES.spacing, collisions)
+def branch_along(
+    chart: Chart,
+    q: Array,
+    k: int,
+    direction: int,
+    collisions: Collisions | None = None,
+    spacing: float = RULES.spacing,
+    folds: bool = True,
+) -> Branch:
+    """The curve from q (n,) inside on which x and all coordinates but the k-th stay, which rises (1) or falls (-1).
 
-    def rising(points: Array, t: Array) -> Array:
-        gradient = chart.coordinates.jacobian(points)[:, k]
-        lengths = np.linalg.norm(gradient, axis=1)
-        return np.asarray(sign * (gradient * t).sum(axis=1) / np.where(lengths > 0, lengths, 1.0))
+    With r = 1, no collisions and a C compiler, it is found in C, which is compiled at the first call for a chart.
 
-    return curve.follow(q, sign * chart.parts.batched_rates(q[None])[0, row], rising)
+    Args:
+        chart: the chart.
+        q: the start.
+        k: number of the coordinate.
+        direction: 1 or -1.
+        collisions: what the robot may hit; the curve ends at a contact.
+        spacing: largest distance of points [rad] or [m].
+        folds: whether the curve ends where the coordinate turns back.
+    """
+    kernel = chart.parts.motion_kernel if collisions is None else None
+    way = None if kernel is None else kernel.follow(q, chart.phi(q)[: chart.m], direction, folds, spacing)
+    if way is None:
+        row = chart.m + k
+        held, gradient = np.delete(np.arange(chart.n), row), direction * chart.parts.batched_rates(q[None])[0, row]
 
+        def rise(points: Array, t: Array) -> Array:
+            gradients = chart.coordinates.jacobian(points)[:, k]
+            lengths = np.linalg.norm(gradients, axis=1)
+            return np.asarray(direction * (gradients * t).sum(axis=1) / np.where(lengths > 0, lengths, 1.0))
 
-def xi_along(chart: Chart, points: Array) -> Array:
-    """Coordinates (N, r) along a curve from its first point on, without the jumps of circle-valued ones."""
-    return counted_on(chart.xi(points), chart.parts.turns[chart.m :])
+        return LevelCurve(chart, held, spacing, collisions).follow(q, gradient, rise if folds else None)
+    # Which boundary stops the way is asked just beyond it.
+    if way.stop == WALL:
+        walls = Walls(chart.problem)
+        stop = walls.stop(int(np.argmin(walls.values(way.beyond))), way.q[-1])
+    else:
+        stop = Stop({ENDLESS: StopKind.ENDLESS, SINGULAR: StopKind.SINGULAR, FOLD: StopKind.FOLD}[way.stop])
+    return Branch(way.q, way.length, stop, way.xi[:, None])
 
 
 def too_far(chart: Chart, q: Array, wanted: Array) -> str:
@@ -242,12 +266,12 @@ def too_far(chart: Chart, q: Array, wanted: Array) -> str:
 
 def fan_along(chart: Chart, q: Array, k: int) -> Fan:
     """The fan of the k-th coordinate at a joint position (n,) inside the domain."""
-    down, up = branch_along(chart, q, k, -1.0), branch_along(chart, q, k, 1.0)
+    down, up = branch_along(chart, q, k, -1), branch_along(chart, q, k, 1)
     if down.endless:  # then one direction passes everything
-        down = Branch(q[None], np.zeros(1), down.stop)
+        down = down.start
     points = np.concatenate([down.q[:0:-1], up.q])
     arc_length = np.concatenate([-down.arc_length[:0:-1], up.arc_length])
-    xi = chart.xi(points)[:, k]
+    xi = np.concatenate([down.xi[:0:-1], up.xi])[:, k]
     turn = getattr(chart.coordinates, "turn", 0.0)
     xi = np.unwrap(xi, period=turn) if turn else xi
     return Fan(chart.labels[chart.m + k], points, xi, arc_length, down.stop, up.stop)
@@ -260,6 +284,12 @@ class Branch:
     q: Array  #: (N, n) joint positions, the start first
     arc_length: Array  #: (N,) from the start [rad] or [m]
     stop: Stop
+    xi: Array  #: (N, r)
+
+    @property
+    def start(self) -> Branch:
+        """The start alone."""
+        return Branch(self.q[:1], self.arc_length[:1], self.stop, self.xi[:1])
 
     @property
     def endless(self) -> bool:
@@ -303,7 +333,7 @@ class LevelCurve:
         # the tangent on the side of the direction
         t = self._correct(target, q[None], direction[None])[1][0]
         if not np.isfinite(t).all():
-            return Branch(q[None], np.zeros(1), Stop(StopKind.SINGULAR))
+            return Branch(q[None], np.zeros(1), Stop(StopKind.SINGULAR), self._chart.xi(q)[None])
         points, tangents, steps, stop = [q[None]], [t[None]], [(q, t)], None
         for new, onward, ended in self._step_on(target, q, t):
             steps.append((new, onward))
@@ -319,7 +349,7 @@ class LevelCurve:
                 break
         assert stop is not None
         q, t = np.concatenate(points), np.concatenate(tangents)
-        return Branch(q, np.concatenate([[0.0], np.cumsum(_measure_arcs(q, t))]), stop)
+        return Branch(q, np.concatenate([[0.0], np.cumsum(_measure_arcs(q, t))]), stop, self._chart.xi(q))
 
     def _step_on(self, target: Array, q: Array, t: Array) -> Iterator[tuple[Array, Array, Stop | None]]:
         """Points (n,) and tangents of long steps from q (n,) along t, near the curve, and at last what ended it."""

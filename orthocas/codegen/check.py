@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from orthocas.charts.chart import Chart
 from orthocas.codegen.generate import GeneratedC
-from orthocas.codegen.library import CompiledLibrary, compile_shared, find_compilers, gain_numbers
+from orthocas.codegen.library import CompiledLibrary, compile_shared, gain_numbers
 from orthocas.codegen.rendering import DOUBLE, SINGLE, Precision, find_bounds_inside
 from orthocas.control.controller import (
     FROM_THE_LAW,
@@ -19,6 +19,7 @@ from orthocas.control.controller import (
     find_squared_volume,
 )
 from orthocas.errors import AgreementError
+from orthocas.native.libraries import find_compilers
 from orthocas.tools.batch import Batched
 from orthocas.tools.checks import Array, require_kind
 from orthocas.tools.expressions import wrap_shortest

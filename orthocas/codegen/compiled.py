@@ -1,135 +1,30 @@
 """CasADi functions and integrators compiled for this process; libraries are kept for equal code."""
 
 import ctypes
-import hashlib
-import importlib.util
-import os
-import re
-import sys
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import cache
-from pathlib import Path
 from typing import Any
 
 import casadi as ca
 import numpy as np
 import scipy
 
-from orthocas.codegen.kernels import generate_kernels
-from orthocas.codegen.library import find_compilers, pointer
 from orthocas.codegen.rendering import render
-from orthocas.errors import CompileError, SimulationError
+from orthocas.errors import SimulationError
+from orthocas.native.kernels import generate_kernels
+from orthocas.native.libraries import keep_library, load_library, pointer
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array, as_path
-from orthocas.tools.files import compute_digest, make_folder, open_draft_folder, publish
+from orthocas.tools.checks import Array
 from orthocas.tools.interrupts import deferred
-from orthocas.tools.processes import run_program
 
 # -O3 takes twice as long, and gains little.
 _FLAGS = ("-O2",)
-_INCLUDED = re.compile(r'^#include "(\w+\.c)"', re.MULTILINE)
 _PREFIX = "kernel"
 _ENTRY = """int {name}(const double **arg, double **res, int *iw, double *w) {{
   return {prefix}_{name}(arg, res, iw, w, 0);
 }}"""
 # As in templates/runner.c.jinja.
 _STAGES = 12
-
-
-def keep_library(kind: str, sources: Mapping[str, str], flags: Sequence[str], folder: str | Path | None = None) -> Path:
-    """The shared library of C sources, compiled now or earlier: its name is a digest of sources, compiler and flags.
-
-    Args:
-        kind: begins the name of the library.
-        sources: contents of the files by name.
-        flags: of the compiler.
-        folder: where libraries are kept; default `orthocas/libraries` in $XDG_CACHE_HOME or ~/.cache.
-
-    Raises:
-        CompileError: if there is no C compiler, or it fails, or the folder is not the user's own.
-        InvalidValueError: if the folder cannot be written.
-    """
-    compiler, options = _choose_compiler(), ("-std=c99", "-fPIC", "-shared", *flags)
-    content = [*(text.encode() for text in sources.values()), repr((compiler, options)).encode()]
-    name = f"{kind}-{hashlib.sha256(b'/'.join(content)).hexdigest()[:32]}.so"
-    place = _find_cache() if folder is None else as_path("folder", folder)
-    library = make_folder("folder", place, mode=0o700).resolve() / name
-    _require_own(library.parent)
-    # Draft and checksum appear together, so that other processes never see half a library.
-    if not _is_whole(library):
-        with open_draft_folder() as place, publish(library.parent) as drafts:
-            for file, text in sources.items():
-                (place / file).write_text(text, encoding="utf-8")
-            # Files that others include are a part of those.
-            included = {name for text in sources.values() for name in _INCLUDED.findall(text)}
-            code = [str(place / file) for file in sources if file.endswith(".c") and file not in included]
-            run_program([*compiler, *options, "-o", str(drafts / name), *code, "-lm"])
-            (drafts / f"{name}.sha256").write_text(compute_digest(drafts / name))
-    return library
-
-
-def _choose_compiler() -> tuple[str, ...]:
-    """The command that compiles C: a compiler on the PATH, or that of the package ziglang, which pip installs anywhere.
-
-    Raises:
-        CompileError: if there is neither.
-    """
-    try:
-        return (find_compilers()[0],)
-    except CompileError:
-        if importlib.util.find_spec("ziglang") is None:
-            raise
-        return (sys.executable, "-m", "ziglang", "cc")
-
-
-def _find_cache() -> Path:
-    """Where libraries are kept by default."""
-    # Relative paths in XDG_CACHE_HOME do not count, as its specification demands.
-    place = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    return (place if place.is_absolute() else Path.home() / ".cache") / "orthocas" / "libraries"
-
-
-def load_library(library: Path) -> ctypes.CDLL:
-    """Load a library that was kept.
-
-    Raises:
-        CompileError: if it is damaged or missing, or others could have put it there.
-    """
-    _require_own(library.parent)
-    if not _is_whole(library):
-        raise CompileError(f"cannot load {library}: it does not match its checksum; compile again")
-    _require_own(library)
-    try:
-        return ctypes.CDLL(str(library))
-    except OSError as error:
-        raise CompileError(f"cannot load {library}: {error}; delete it and compile again") from None
-
-
-def _require_own(place: Path) -> None:
-    """Refuse libraries that others could have written: they would run with our rights.
-
-    Raises:
-        CompileError: if a folder or file belongs to somebody else but root, or others may write there.
-    """
-    # On Windows, the rights of a folder come from the one above.
-    if not hasattr(os, "geteuid"):
-        return
-    try:
-        result = place.stat()
-    except OSError as error:
-        raise CompileError(f"cannot load {place}: {error.strerror}") from None
-    if result.st_uid not in (os.geteuid(), 0):
-        raise CompileError(f"no library is loaded from {place}: it belongs to user {result.st_uid}, expected your own")
-    if result.st_mode & 0o022:
-        raise CompileError(f"no library is loaded from {place}: others may write there, expected your own (chmod go-w)")
-
-
-def _is_whole(library: Path) -> bool:
-    """Whether a library is complete: the system ends processes that load half of one."""
-    try:
-        return library.with_name(f"{library.name}.sha256").read_text() == compute_digest(library)
-    except (OSError, ValueError):
-        return False
 
 
 class Kernel(ctypes.Structure):

@@ -18,11 +18,11 @@ from orthocas.charts.curve_tracer import RULES
 from orthocas.charts.curves import Nearest, SelfMotionCurves
 from orthocas.charts.inverse import Inverse, Solutions, build_phi, build_phi_of_wish, solve_rows
 from orthocas.charts.newton import NEWTON, Attempt, Newton
-from orthocas.codegen.compiled import keep_library, load_library
 from orthocas.codegen.generate import generate_c
-from orthocas.codegen.kernels import generate_kernels
-from orthocas.codegen.library import pointer
 from orthocas.codegen.rendering import get_source, render
+from orthocas.native import rendering
+from orthocas.native.kernels import generate_kernels
+from orthocas.native.libraries import keep_library, load_library, pointer
 from orthocas.tools.batch import dense_function, run_in_threads
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, require_kind
@@ -74,7 +74,7 @@ def compile_inverse(chart: Chart, folder: str | Path | None = None) -> CompiledI
     sources[_ROWS] = get_source(_ROWS)
     curves = chart.parts.inverse.curves
     if curves is not None:
-        sources |= {name: get_source(name) for name in ("curve_rows.c", "curve_math.c")}
+        sources |= {"curve_rows.c": get_source("curve_rows.c"), "curve_math.c": rendering.get_source("curve_math.c")}
         sources["curves.c"] = write_curve_source(chart, curves)
     return CompiledInverse(chart, keep_library("inverse", sources, (*_FLAGS, f"-DN={chart.n}"), folder))
 

@@ -18,9 +18,10 @@ from orthocas.codegen.distance import build_distance_form
 from orthocas.codegen.export_forms import Form, build_form, build_inverse_forms, write_function, write_statuses
 from orthocas.codegen.rendering import is_generated, render
 from orthocas.control.controller import LARGEST, SMALLEST_VOLUME, ControlStatus
-from orthocas.control.linear_algebra import ROUNDS, SOFTEST
+from orthocas.control.linear_algebra import SOFTEST
 from orthocas.control.operational_space import Impedance, PDPlus
 from orthocas.errors import ArchiveError, InvalidValueError
+from orthocas.native.kernels import ROUNDS
 from orthocas.robots.capsules import FittedCapsules
 from orthocas.tools.batch import dense_function
 from orthocas.tools.checks import Array, as_path, require_kind, require_known

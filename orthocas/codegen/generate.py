@@ -14,7 +14,6 @@ import numpy as np
 from orthocas.charts.chart import Chart
 from orthocas.charts.chart_file import fingerprint
 from orthocas.codegen.distance import render_distance
-from orthocas.codegen.kernels import Kernels, generate_kernels, share_calls, share_sines
 from orthocas.codegen.rendering import (
     DOUBLE,
     SINGLE,
@@ -31,6 +30,7 @@ from orthocas.control.controller import Controller, require_controller
 from orthocas.control.memory import find_memory
 from orthocas.control.safety import Safety
 from orthocas.errors import ArchiveError, InvalidValueError
+from orthocas.native.kernels import Kernels, generate_kernels, share_calls, share_sines
 from orthocas.robots.capsules import FittedCapsules
 from orthocas.robots.kinematics import TipTurn
 from orthocas.tools.checks import Array, as_path, require_kind, require_shape
@@ -54,6 +54,7 @@ class LibraryRules:
 
     locals_bytes: int = 5120  #: of stack; 1 to 4.5 KiB with up to seven joints (tests/codegen/test_c_safety.py)
     evaluations: int = 100  #: of the chart, at most, in one call of the inverse map
+    contact_margin: float = 0.02  #: that links keep under the supervised law [m]
 
 
 RULES = LibraryRules()
@@ -95,7 +96,8 @@ def generate_c(
         single_precision: whether numbers are `float` instead of `double`, for processors that compute in single
             precision only.
         capsules: of `oc.fit_capsules(robot.collisions)`: also write NAME_distance.c and NAME_distance.h with
-            NAME_distance, the least distance of the links and its gradient.
+            NAME_distance, the least distance of the links and its gradient. With a torque law, the supervised law then
+            keeps 2 cm between them: contacts count as a part of its boundary.
 
     Raises:
         NoExpressionError: if the chart is grown; `orthocas.distil` turns it into a chart with a closed expression.
@@ -131,7 +133,7 @@ def generate_c(
     kernels = generate_kernels(_build_functions(chart, controller, precision), f"{name}_kernel")
     stack_bytes = _bound_stack(kernels, chart, controller, precision.size)
     values = _describe_library(chart, controller, name, precision, kernels) | {"stack_bytes": stack_bytes}
-    values["distances"] = capsules is not None
+    values |= {"distances": capsules is not None, "contact_margin": RULES.contact_margin}
     values |= _describe_chart(chart, precision) | {"check": _compute_check(chart, controller, precision)}
     if controller is not None and safety is not None:
         values |= describe_law(controller) | describe_supervision(controller, safety)
@@ -213,7 +215,7 @@ def _bound_stack(kernels: Kernels, chart: Chart, controller: Controller | None, 
     if controller is not None:
         k, memory = len(controller.labels), find_memory(controller)
         remembered = 0 if memory is None else sum(map(len, memory.start.values()))
-        law = 2 * n * n + 10 * n + 9 * k + kernels.numbers["shared"] + remembered
+        law = 3 * n * n + 10 * n + 9 * k + kernels.numbers["shared"] + remembered
         law += 3 * k + sum(map(len, controller.gains.values()))
     # Compilers keep matrices in local variables, and some kernels run inside others.
     locals_ = round(RULES.locals_bytes * max(1.0, n / 7) ** 2)

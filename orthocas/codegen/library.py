@@ -3,14 +3,13 @@
 from __future__ import annotations
 
 import ctypes
-import shutil
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 from orthocas.charts.chart import Chart
 from orthocas.codegen.generate import GeneratedC, generate_c
@@ -19,7 +18,7 @@ from orthocas.control.controller import Controller, ControlStatus, require_contr
 from orthocas.control.memory import find_memory
 from orthocas.control.operational_space import PDPlus
 from orthocas.control.safety import Safety
-from orthocas.errors import CompileError
+from orthocas.native.libraries import find_compilers, pointer
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, as_float_array, as_number, as_point, require_kind, require_shape
 from orthocas.tools.files import open_draft_folder
@@ -34,22 +33,6 @@ _STATES = 64
 _MICROSECONDS = 3e5
 
 
-def find_compilers() -> tuple[str, ...]:
-    """Compilers: those of gcc and clang that are on the PATH, or cc if neither is.
-
-    Raises:
-        CompileError: if there is no compiler.
-    """
-    result = [path for name in ("gcc", "clang") if (path := shutil.which(name)) is not None]
-    result = result or [path for path in (shutil.which("cc"),) if path is not None]
-    if not result:
-        raise CompileError(
-            "no C compiler found, expected gcc, clang or cc on the PATH: apt install gcc, xcode-select --install, or "
-            "pip install ziglang, which suffices for all that is compiled while Python runs"
-        )
-    return tuple(result)
-
-
 def compile_shared(
     generated: GeneratedC, folder: Path, flags: tuple[str, ...] = ("-O2",), compiler: str | None = None
 ) -> Path:
@@ -59,10 +42,20 @@ def compile_shared(
         CompileError: if compilation fails; the message starts with the compiler's first lines.
     """
     library = folder / f"lib{generated.name}.so"
-    source = generated.folder / f"{generated.name}.c"
+    sources = [generated.folder / f"{generated.name}{end}.c" for end in ("", "_distance")]
     compiler = find_compilers()[0] if compiler is None else compiler
     warnings = (*STRICT, *(NO_DOUBLE if generated.single_precision else ()))
-    command = [compiler, *warnings, *flags, "-fPIC", "-shared", "-o", str(library), str(source), "-lm"]
+    command = [
+        compiler,
+        *warnings,
+        *flags,
+        "-fPIC",
+        "-shared",
+        "-o",
+        str(library),
+        *(str(path) for path in sources if path.exists()),
+        "-lm",
+    ]
     run_program(command)
     return library
 
@@ -354,7 +347,7 @@ def _build_state(
     layout |= dict.fromkeys(names, joints) | dict.fromkeys(("offset", "integral"), quantities)
     if has_spring:
         layout |= dict.fromkeys(("load", "drive", "speed"), joints) | {"inertia": number * n**2}
-        layout |= dict.fromkeys(("expected", "unexplained"), joints)
+        layout |= dict.fromkeys(("expected", "unexplained", "momentum", "trend"), joints)
     # Laws that remember have their fields before the last reference.
     if memory._fields_:
         layout["memory"] = memory
@@ -365,12 +358,6 @@ def _build_state(
 def _build_struct(name: str, layout: dict[str, Any]) -> type[ctypes.Structure]:
     """A struct of C with these fields, in order."""
     return type(name, (ctypes.Structure,), {"_fields_": list(layout.items())})
-
-
-def pointer(array: NDArray[Any]) -> ctypes.c_void_p:
-    """The place of an array, contiguous, that somebody else keeps until the call ends. `data_as` takes microseconds."""
-    assert array.flags.c_contiguous
-    return ctypes.c_void_p(array.__array_interface__["data"][0])
 
 
 @dataclass(frozen=True)

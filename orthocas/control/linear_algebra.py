@@ -7,15 +7,13 @@ import casadi as ca
 import numpy as np
 
 from orthocas.bases.family import Expression
+from orthocas.native.kernels import LARGE_INVERSE, ROOT_TIMES, ROUNDS
 from orthocas.tasks.metric import Metric
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.expressions import WRITTEN_OUT
 
-LARGE_INVERSE = "large_inverse"  #: name of the functions for which generated C has code of its own
-ROOT_TIMES = "root_times"  #: likewise
-ROUNDS = 8  #: accurate to rounding up to a condition number of 1e6 (tests/control/test_control_algebra.py)
 SOFTEST = 1e-6  #: smallest squared frequency in double_diagonal, relative to the largest: K_i = 0 divides by zero
 
 

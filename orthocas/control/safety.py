@@ -34,6 +34,7 @@ class SafetyRules:
     samples: int = 256  #: of the domain, for spans and gravity
     seed: int = 0  #: of the samples
     torque_rate: float = 1000.0  #: of commands, as on many arms: 1 N m in a millisecond [N m/s]
+    full_force: float = 0.1  #: time in which a sliding joint gets its whole force [s]
     acceleration: float = 20.0  #: of commands of velocity laws [rad/s^2]
     speed: float = 4 * np.pi  #: of joints without a limit [rad/s] or [m/s]
     fraction: float = 0.7  #: of the speed limit, for references
@@ -44,6 +45,7 @@ class SafetyRules:
     stops: float = 30.0  #: natural frequency at the joint limits [rad/s]
     zone: float = 0.05  #: of stops, at most this share of the range of a joint [rad] or [m]
     stuck_speed: float = 0.15  #: that commands must have given to an arm that measures the same [rad/s]
+    stuck: float = 0.25  #: and at most this share of the speed limit
     stuck_way: float = 0.03  #: likewise of velocity laws [rad]
     friction: float = 2.0  #: that may hold a joint at a start beside its torque [N m] or [N]
     most_friction: float = 12.5  #: and most that may hold it against the law, later [N m] or [N]
@@ -86,7 +88,9 @@ class Safety:
     offset_rate: Annotated[Array, "speed at which the reference goes from the arm to what is asked (k,) [1/s]"]
     integral_rate: Annotated[Array, "integral action: growth of the reference's shift per error (k,) [1/s]; 0: none"]
     integral_limit: Annotated[Array, "largest shift (k,)"]
-    hold_ticks: Annotated[int, "ticks without a good measurement for which the last command is held"]
+    hold_ticks: Annotated[
+        int, "ticks without a good measurement for which the last command is held; beyond 1 ms each: milliseconds"
+    ]
     stale_ticks: Annotated[
         int, "ticks for which a moving arm may measure the same, bit by bit; more are a bad measurement"
     ]
@@ -174,8 +178,12 @@ class Safety:
         speed_limit = np.where(np.isfinite(robot.velocity_limits), robot.velocity_limits, RULES.speed)
         slow = np.minimum(RULES.return_speed, speed_limit / 3)
         efforts = np.where(np.isfinite(robot.effort_limits), robot.effort_limits, gravity)
+        # Motors of sliding joints have the force of many newtons, and give it as soon as others their torque.
+        sliding = np.where(
+            robot.tree.prismatic & np.isfinite(robot.effort_limits), robot.effort_limits / RULES.full_force, 0.0
+        )
         settings = {
-            "command_rate": np.full(n, RULES.torque_rate if torque else RULES.acceleration),
+            "command_rate": np.fmax(RULES.torque_rate, sliding) if torque else np.full(n, RULES.acceleration),
             "speed_limit": speed_limit,
             "rest_speed": np.full(n, 0.5),
             "near_margin": 0.06,
@@ -192,7 +200,9 @@ class Safety:
             "integral_limit": 0.05 * span,
             "hold_ticks": 10,
             "stale_ticks": 5,
-            "stuck_speed": np.full(n, RULES.stuck_speed if torque else RULES.stuck_way),
+            "stuck_speed": np.minimum(RULES.stuck_speed, RULES.stuck * speed_limit)
+            if torque
+            else np.full(n, RULES.stuck_way),
             "longest_period": 0.02,
             "observer_rate": np.zeros(n),
             "encoder_step": np.zeros(n),

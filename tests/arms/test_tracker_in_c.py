@@ -11,8 +11,8 @@ from programs import nightly
 import orthocas as oc
 from orthocas.arms import TrackStatus
 from orthocas.arms.chart_kernel import RULES, PosturesInC, tracker_type
-from orthocas.codegen.library import find_compilers
 from orthocas.errors import InvalidValueError
+from orthocas.native.libraries import find_compilers
 
 WARNINGS = ("-std=c99", "-O2", "-Wall", "-Wextra", "-Werror", "-pedantic")
 

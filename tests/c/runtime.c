@@ -252,7 +252,7 @@ static const orthocas_arm *arm;
 static orthocas_state state;
 static orthocas_safety safety;
 static orthocas_reference reference, given;
-static double numbers[40 * N + 2 * N * N], settings[20][N], values[6][K], work[WORK];
+static double numbers[48 * N + 2 * N * N], settings[20][N], values[6][K], work[WORK];
 static double q[N], dq[N], command[N], limit[N], used[2 * N];
 static const double anything[N] = {INFINITY, INFINITY, INFINITY};
 
@@ -292,8 +292,9 @@ static void open_all(const orthocas_arm *which) {
   double *next = numbers, **places[] = {&state.q, &state.dq, &state.seen_q, &state.seen_dq, &state.command, &state.led,
                                         &state.impulse, &state.impulse_from, &state.law, &state.anchor, &state.safe,
                                         &state.limit, &state.offset, &state.integral, &state.load, &state.drive,
-                                        &state.speed, &state.expected, &state.unexplained, &state.reference.value,
-                                        &state.reference.velocity, &state.reference.acceleration};
+                                        &state.speed, &state.expected, &state.unexplained, &state.momentum, &state.trend,
+                                        &state.reference.value, &state.reference.velocity,
+                                        &state.reference.acceleration};
   size_t i;
   memset(&state, 0, sizeof state);
   memset(numbers, 0, sizeof numbers);
@@ -960,9 +961,52 @@ static void test_boundary(void) {
   CHECK(fabs(inner[0] - 0.2) < 1e-12);
 }
 
+/* ---- R32: contacts ---- */
+
+static int gap_at(const double *q, double *gap, double *gradient, double *points, int *pair) {
+  int i;
+  *gap = 0.5 - q[0];
+  *pair = 0;
+  for (i = 0; i < N; ++i) gradient[i] = i == 0 ? -1.0 : 0.0;
+  for (i = 0; i < 6; ++i) points[i] = 0.0;
+  return fault.inwards > 0.0 ? 3 : 0;
+}
+
+static void test_contacts(void) {
+  int k;
+  start_law(arm);
+  set(dq, 0.5, 0.0, 0.0);
+  for (k = 0; k < 1000 && state.mode == ORTHOCAS_LAW; ++k) {
+    q[0] += 0.5e-3;
+    reference.value[0] = q[0];
+    (void)step(1e-3);
+  }
+  CHECK(state.mode == ORTHOCAS_CATCHER && state.cause == ORTHOCAS_OUTSIDE_DOMAIN);
+  CHECK(q[0] < 0.481 - 0.5 * (safety.fade_out + 1.0 / safety.damping) && q[0] > 0.3);
+  fault.inwards = 1.0; /* no distance */
+  CHECK(contact_room(arm, q, work) < 0.0);
+  good();
+}
+
+/* Measurements end while the arm moves: its command brakes it as foreseen, and goes on to what holds it. */
+static void test_blind(void) {
+  double least = 0.0;
+  int k;
+  start_law(arm);
+  set(dq, 0.0, 0.4, 0.0);
+  for (k = 0; k < 400; ++k) {
+    (void)step(1e-3);
+    q[2] = NAN;
+    if (k == 20) least = state.command[1] - 0.1 * state.q[1];
+  }
+  q[2] = 0.0;
+  CHECK(state.mode == ORTHOCAS_CATCHER && least < -0.5);
+  CHECK(fabs(state.dq[1]) < 0.02);
+}
+
 int main(void) {
   const orthocas_arm arms[] = {plain(), with_memory(), with_orientation(), with_gram(0), with_gram(1), in_corridor()};
-  orthocas_arm velocity = plain();
+  orthocas_arm velocity = plain(), touching = plain();
   size_t k;
   velocity.torque = 0;
   for (k = 0; k < sizeof arms / sizeof *arms; ++k) {
@@ -976,11 +1020,16 @@ int main(void) {
     test_modes();
     test_reference();
     test_observer();
+    test_blind();
     test_programs();
     open_all(arms + k);
     test_boundary();
     if (arms[k].memory > 0) test_memory();
   }
+  touching.kernels.gap_of_links = gap_at;
+  touching.contact_margin = 0.02;
+  open_all(&touching);
+  test_contacts();
   open_all(&velocity);
   test_settings();
   test_start();

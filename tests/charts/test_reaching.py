@@ -44,6 +44,24 @@ def test_self_motion_of_a_planar_arm_is_the_closed_form() -> None:
     np.testing.assert_allclose(motion.q, expected, atol=1e-9)
 
 
+@pytest.mark.parametrize("name", ["panda-wide", "xarm7-pose", "circle"])
+def test_c_and_python_end_at_the_same_places(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Without a C compiler, Python follows the curves: ranges agree to 1e-9, and so do ends of self-motions."""
+    chart = circle() if name == "circle" else oc.load(name)
+    q = chart.domain.sample(20, 5)
+    in_c = [(chart.xi_range(point), chart.self_motion(point)) for point in q]
+    monkeypatch.setattr(type(chart.parts), "motion_kernel", None)
+    for point, (reach, motion) in zip(q, in_c, strict=True):
+        other, curve = chart.xi_range(point), chart.self_motion(point)
+        np.testing.assert_allclose(reach.low, other.low, rtol=0, atol=1e-9)
+        np.testing.assert_allclose(reach.high, other.high, rtol=0, atol=1e-9)
+        assert str(reach[0].low_stop) == str(other[0].low_stop)
+        assert isinstance(motion, SelfMotionCurve)
+        assert isinstance(curve, SelfMotionCurve)
+        assert (motion.closed, motion.folds) == (curve.closed, curve.folds)
+        np.testing.assert_allclose(motion.q[[0, -1]], curve.q[[0, -1]], rtol=0, atol=1e-9)
+
+
 def test_arc_length_is_that_of_the_closed_form() -> None:
     chart = planar_arm(oc.Box([0.6, 0.8, 0.8], 0.6))
     motion = chart.self_motion([0.6, 0.8, 0.8], step=0.1)

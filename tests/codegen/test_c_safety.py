@@ -14,9 +14,10 @@ from programs import built, needs_c, path_flags
 
 import orthocas as oc
 from orthocas.codegen import CompiledLibrary, GeneratedC, check_c, compile_shared, gain_numbers
-from orthocas.codegen.library import STRICT, find_compilers
+from orthocas.codegen.library import STRICT
 from orthocas.control import Controller, ControlStatus, PDPlus
 from orthocas.errors import CompileError
+from orthocas.native.libraries import find_compilers
 from orthocas.tasks.corridor import Corridor
 
 pytestmark = [needs_c, pytest.mark.slow]

@@ -16,9 +16,9 @@ from programs import needs_c, nightly
 
 import orthocas as oc
 from orthocas.codegen import CompiledLibrary, GeneratedC, check_c, compile_shared, gain_numbers
-from orthocas.codegen.kernels import share_calls, share_sines
 from orthocas.control import Controller, ControlStatus, Impedance, Kinematic, PDPlus
 from orthocas.errors import AgreementError, CompileError
+from orthocas.native.kernels import share_calls, share_sines
 from orthocas.tasks.samples import sample_uniform
 
 pytestmark = needs_c

@@ -16,10 +16,11 @@ from programs import Run, needs_c, needs_cmake, output_of
 
 import orthocas as oc
 from orthocas.codegen import GeneratedC, check_c
-from orthocas.codegen.library import STRICT, find_compilers
+from orthocas.codegen.library import STRICT
 from orthocas.control import PDPlus
 from orthocas.errors import InvalidValueError, NoExpressionError, one_line
 from orthocas.fitting.fit import Fit
+from orthocas.native.libraries import find_compilers
 
 pytestmark = needs_c
 

@@ -13,8 +13,9 @@ from solid_arms import BALL, build_arm
 
 import orthocas as oc
 from orthocas.codegen import GeneratedC
-from orthocas.codegen.library import NO_DOUBLE, STRICT, find_compilers
+from orthocas.codegen.library import NO_DOUBLE, STRICT
 from orthocas.errors import InvalidValueError
+from orthocas.native.libraries import find_compilers
 from orthocas.robots.capsules import FittedCapsules
 from orthocas.robots.collisions import Collisions, Part
 from orthocas.robots.shapes import BallGeometry, BoxGeometry, Shape

@@ -13,9 +13,9 @@ from programs import needs_c
 from public_objects import circle, clear, exact, wide
 
 import orthocas as oc
-from orthocas.codegen import compiled
 from orthocas.errors import CompileError, NoExpressionError
 from orthocas.fitting.fit import Fit
+from orthocas.native import libraries
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.expressions import wrap_shortest
 
@@ -141,7 +141,7 @@ def test_a_relative_cache_does_not_count(monkeypatch: pytest.MonkeyPatch, tmp_pa
     monkeypatch.setenv("HOME", str(tmp_path))
     for given, wanted in (("cache", tmp_path / ".cache"), ("", tmp_path / ".cache"), ("/var/tmp", Path("/var/tmp"))):
         monkeypatch.setenv("XDG_CACHE_HOME", given)
-        assert compiled._find_cache() == wanted / "orthocas" / "libraries"
+        assert libraries._find_cache() == wanted / "orthocas" / "libraries"
 
 
 @pytest.mark.slow

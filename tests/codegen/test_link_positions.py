@@ -36,6 +36,9 @@ def test_springs_carry_gravity_or_what_sensors_measure(planar_for_control: oc.Ch
         q, status = library.link_positions(*map(np.array, spoiled))
         assert ControlStatus(status) is ControlStatus.NOT_FINITE
         assert not q.any()
+    # Gears so soft that the arm falls over do not converge.
+    _, status = library.link_positions(motors, np.full(3, 20.0))
+    assert ControlStatus(status) is ControlStatus.STOPPED_EARLY
     with pytest.raises(ShapeError):
         library.link_positions(motors[:2], stiffness)
 

@@ -15,11 +15,11 @@ from programs import Run, built, needs_c, output_of
 
 import orthocas as oc
 from orthocas.codegen import CompiledLibrary, GeneratedC, Supervisor, check_c, compile_shared, gain_numbers
-from orthocas.codegen.library import find_compilers
 from orthocas.codegen.rendering import SINGLE
 from orthocas.control import Controller, ControlStatus, Impedance, Kinematic, PDPlus, Safety
 from orthocas.errors import AgreementError
 from orthocas.fitting.fit import Fit
+from orthocas.native.libraries import find_compilers
 from orthocas.tools.checks import Array
 
 pytestmark = needs_c

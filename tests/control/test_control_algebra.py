@@ -11,9 +11,9 @@ import numpy as np
 import pytest
 from scipy.linalg import eigh, sqrtm
 
-from orthocas.codegen.kernels import generate_kernels
-from orthocas.codegen.library import find_compilers
 from orthocas.control.linear_algebra import DAMPING_DESIGNS, DampingDesign, apply_damping, invert_spd, multiply_by_root
+from orthocas.native.kernels import generate_kernels
+from orthocas.native.libraries import find_compilers
 from orthocas.tools.checks import Array
 from orthocas.tools.processes import run_program
 

@@ -50,7 +50,7 @@ READERS = {  #: functions that read files, by module and name, with the campaign
     "arms.arm_file.read_charts": "arms",
     "charts.chart_file.read_chart": "charts",
     "charts.ready.load": "charts",
-    "codegen.compiled.load_library": "libraries",
+    "native.libraries.load_library": "libraries",
     "paths.recordings.read_joints": "motions",
     "paths.tool_path.read_path": "paths",
     "tasks.corridor.read_postures": "postures",

@@ -10,8 +10,7 @@ import numpy as np
 
 from fuzz.child import Finding, run, verdict
 from fuzz.mutants import Rng, flipped, pick
-from orthocas.codegen.compiled import keep_library, load_library
-from orthocas.codegen.library import find_compilers
+from orthocas.native.libraries import find_compilers, keep_library, load_library
 
 _SOURCE = "int answer(void) { return 42; }\n"
 

@@ -20,7 +20,7 @@ SOURCES = {
 MODULES = {name.removesuffix(".__init__"): path for name, path in SOURCES.items()}
 FACES = ("orthocas.__main__",)  # what nothing else may import
 ORDER = (  # packages import what stands before them, and nothing else
-    *("errors", "version", "tools", "solvers", "robots", "tasks", "bases", "exact", "charts", "certificates"),
+    *("errors", "version", "tools", "native", "solvers", "robots", "tasks", "bases", "exact", "charts", "certificates"),
     *("control", "learn", "codegen", "simulation", "fitting", "paths", "arms", "problems", "viewer", "cli"),
 )
 

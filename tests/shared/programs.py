@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from orthocas.codegen import GeneratedC
-from orthocas.codegen.library import find_compilers
+from orthocas.native.libraries import find_compilers
 from orthocas.tasks.corridor import Corridor
 
 PROGRAMS = Path(__file__).parents[1] / "c"

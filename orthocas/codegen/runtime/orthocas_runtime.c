@@ -37,6 +37,9 @@ static const struct {
   double far_off;     /* from what the observer of velocities expects: it begins anew [rad] or [m] */
   double deep;        /* so near to the path of a corridor is near enough, as it may run along a limit of the box [radii] */
   double hasty;       /* time for which a joint may exceed its speed limit: light ones do as they break away [s] */
+  double stopping;    /* time constant with which a reference comes to rest that does not go on [s] */
+  double trend;       /* rate of the filter of speeds that shows accelerations [1/s] */
+  double contact;     /* distance of links that counts as 1 [m]: catch_margin to return_margin are 2 to 20 mm */
   int forever;        /* ticks; a counter stops there, before it overflows */
   int bisections;     /* of the way of a stream to the boundary: 1e-3 of it */
   int sweeps;         /* of rotations for an eigenvalue; they converge quadratically */
@@ -46,7 +49,7 @@ static const struct {
 #ifndef ORTHOCAS_CHART_ONLY
   .turn = 6.283185307179586, .longest = 1e6, .implausible = 30.0, .jitter = 0.01, .alike = 0.2, .stirring = 1e-3,
   .standing = 0.1, .room = 0.05, .nearly = 0.2, .slow = 1.0 / 3.0, .settling = 0.5, .giving = 0.02, .learning = 2.0,
-  .lifted = 0.5, .far_off = 0.1, .deep = 0.5, .hasty = 5e-3, .forever = 1000000, .bisections = 10, .sweeps = 6,
+  .lifted = 0.5, .far_off = 0.1, .deep = 0.5, .hasty = 5e-3, .contact = 0.2, .trend = 200.0, .stopping = 0.1, .forever = 1000000, .bisections = 10, .sweeps = 6,
 #endif
 };
 
@@ -631,15 +634,24 @@ static double smallest_eigenvalue(double *A, int m) {
   return least;
 }
 
+/* How far the links are from each other beyond contact_margin; 1 where nothing checks that. */
+static double contact_room(const orthocas_arm *arm, const double *q, double *work) {
+  double *gradient = take(&work, arm->n), points[6], gap;
+  int pair;
+  if (arm->kernels.gap_of_links == 0) return 1.0;
+  return arm->kernels.gap_of_links(q, &gap, gradient, points, &pair) == 0 ? (gap - arm->contact_margin) / rules.contact : -1.0;
+}
+
 /* How far q is inside the condition of the domain beside its box, 0 at its boundary; 1 without one. In a corridor: 1 on the
- * path. Of a singular value: 1 as at the centre; or the room to a fold, if that is less. */
+ * path. Of a singular value: 1 as at the centre; or the room to a fold, or to a contact, if that is less. */
 static double clearance(const orthocas_arm *arm, const double *q, double *work) {
   const orthocas_boundary *boundary = &arm->boundary;
-  double *way = take(&work, boundary->lines > 0 ? boundary->counted : arm->m * arm->m), room;
-  if (boundary->lines > 0) return 1.0 - way_from_path(boundary, q, way, work);
-  if (arm->kernels.gram == 0) return 1.0;
+  double *way = take(&work, boundary->lines > 0 ? boundary->counted : arm->m * arm->m);
+  double room = contact_room(arm, q, work);
+  if (boundary->lines > 0) return fmin(room, 1.0 - way_from_path(boundary, q, way, work));
+  if (arm->kernels.gram == 0) return room;
   arm->kernels.gram(q, way);
-  room = (sqrt(fmax(smallest_eigenvalue(way, arm->m), 0.0)) - boundary->bound) / boundary->span;
+  room = fmin(room, (sqrt(fmax(smallest_eigenvalue(way, arm->m), 0.0)) - boundary->bound) / boundary->span);
   return arm->kernels.room_to_fold != 0 ? fmin(arm->kernels.room_to_fold(q), room) : room;
 }
 
@@ -732,6 +744,11 @@ static int frozen(const orthocas_arm *arm, const orthocas_state *state, const do
   return faster_than(arm, dq, safety->rest_speed, rules.stirring) || faster_than(arm, speed, safety->stuck_speed, 1.0);
 }
 
+/* A count of ticks after one more, which counts its milliseconds if there are several: slower programs wait no longer. */
+static int later(int ticks, double period) {
+  return ticks < rules.forever ? ticks + (int)fmax(1.0, fmin(1e3 * period + 0.5, 1e3)) : ticks;
+}
+
 /* Look at a measurement. Returns whether it can be used. */
 static int look(const orthocas_arm *arm, orthocas_state *state, const double *q, const double *dq, double period,
                 double *work) {
@@ -746,8 +763,9 @@ static int look(const orthocas_arm *arm, orthocas_state *state, const double *q,
   if (!same && good) {
     state->same_ticks = 0;
     set_zero(state->impulse, n);
-  } else if (same && state->same_ticks < rules.forever) {
-    ++state->same_ticks;
+    if (arm->torque) set_zero(state->momentum, n);
+  } else if (same) {
+    state->same_ticks = later(state->same_ticks, period);
   }
   return good && !frozen(arm, state, dq, work);
 }
@@ -763,6 +781,7 @@ static void watch_sensors(const orthocas_arm *arm, orthocas_state *state, const 
     const double held = arm->torque ? state->safety->friction[i] : 0.0;
     const double least = fmin(from[i], fallback[i]) - held, most = fmax(from[i], fallback[i]) + held;
     state->impulse[i] += (command[i] - fmin(fmax(command[i], least), most)) * period;
+    if (arm->torque) state->momentum[i] += (command[i] - fmin(fmax(command[i], least + held), most - held)) * period;
   }
 }
 
@@ -803,19 +822,51 @@ static void move_anchor(const orthocas_arm *arm, orthocas_state *state, double p
 
 static int works(int law) { return law == ORTHOCAS_OK || law == ORTHOCAS_SATURATED; }
 
+/* Whether joints are faster than their limits, or are on the way there: they go on to accelerate, half as much on average, until
+ * the torque that drives them is taken back, which takes time by command_rate. */
+static int hurries(const orthocas_arm *arm, orthocas_state *state, const double *dq, double period) {
+  const orthocas_safety *safety = state->safety;
+  double until = 0.0;
+  int i, hurry = faster_than(arm, dq, safety->speed_limit, 1.0);
+  for (i = 0; i < arm->n && arm->torque; ++i)
+    until = fmax(until, fabs(state->drive[i] - state->load[i]) / fmax(safety->command_rate[i], arm->numbers.smallest));
+  for (i = 0; i < arm->n && arm->torque; ++i) {
+    const double gained = dq[i] - state->trend[i], soon = 0.5 * rules.trend * gained * until; /* as they gain */
+    hurry = hurry || (state->mode == ORTHOCAS_LAW && gained * dq[i] > 0.0 && fabs(dq[i] + soon) > safety->speed_limit[i]);
+    state->trend[i] += fmin(1.0, rules.trend * period) * gained;
+  }
+  return hurry;
+}
+
+/* R32: whether an arm that the catcher stops from now on stays clear of contacts: speeds towards one are bounded by its
+ * distance over the time that the law takes to give way and the catcher to stop. */
+static int stops_clear(const orthocas_arm *arm, const orthocas_safety *safety, const double *q, const double *dq,
+                       double *work) {
+  const double time = safety->fade_out + 1.0 / safety->damping;
+  double *ahead = take(&work, arm->n), nearest = contact_room(arm, q, work);
+  int i, k;
+  for (k = 1; k <= 2; ++k) {
+    for (i = 0; i < arm->n; ++i) ahead[i] = q[i] + 0.5 * k * time * dq[i];
+    nearest = fmin(nearest, contact_room(arm, ahead, work));
+  }
+  return nearest > 0.0;
+}
+
 /* R12: who commands, by the table of modes. law: its status. Joints may be fast for 5 ms, which they get back in 10 ms. */
 static void choose_mode(const orthocas_arm *arm, orthocas_state *state, int law, const double *q, const double *dq,
                         double clear, double room, const double *error, double period, int late, double *work) {
   const orthocas_safety *safety = state->safety;
-  const int hurries = faster_than(arm, dq, safety->speed_limit, 1.0), fast = hurries && state->hasty >= rules.hasty;
+  const int hurry = hurries(arm, state, dq, period), fast = hurry && state->hasty >= rules.hasty;
   const int ready = works(law) && room >= safety->return_margin;
   double *speed = take(&work, arm->n);
   int i;
   for (i = 0; i < arm->n; ++i) speed[i] = clipped(dq[i], safety->speed_limit[i]);
-  state->hasty = hurries ? fmin(state->hasty + period, rules.hasty) : fmax(0.0, state->hasty - 0.5 * period);
+  state->hasty = hurry ? fmin(state->hasty + period, rules.hasty) : fmax(0.0, state->hasty - 0.5 * period);
   if (state->mode == ORTHOCAS_LAW) {
     if (!works(law)) catch_arm(arm, state, law, q);
     else if (distance(arm, q, speed, safety->fade_out, clear, work) < safety->catch_margin)
+      catch_arm(arm, state, ORTHOCAS_OUTSIDE_DOMAIN, q);
+    else if (arm->kernels.gap_of_links != 0 && !stops_clear(arm, safety, q, dq, work))
       catch_arm(arm, state, ORTHOCAS_OUTSIDE_DOMAIN, q);
     else if (fast) catch_arm(arm, state, ORTHOCAS_TOO_FAST, q);
     else if (late) catch_arm(arm, state, ORTHOCAS_LATE, q);
@@ -833,7 +884,7 @@ static void choose_mode(const orthocas_arm *arm, orthocas_state *state, int law,
 /* ---- the reference of the law ---- */
 
 /* R13: take a reference if it can be followed: finite, and not standing still for long while it claims to move. If not,
- * the last value holds. measured, error: those of the value; change: its difference from the last one. Returns whether it
+ * the last one comes to rest, and its value holds. measured, error: those of the value; change: its difference from the last one. Returns whether it
  * is good. */
 static int take_reference(const orthocas_arm *arm, orthocas_state *state, const double *shared,
                           const orthocas_reference *reference, double period, double *measured, double *error,
@@ -852,8 +903,13 @@ static int take_reference(const orthocas_arm *arm, orthocas_state *state, const 
   }
   if (bad || !all_finite(arm, error, k) || !all_finite(arm, change, k)) {
     arm->kernels.deviation(shared, state->q, state->reference.value, measured, error);
-    set_zero(change, k);
-    stop_reference(arm, &state->reference);
+    arm->kernels.gap(&state->reference, state->reference.value, change, rate, bend);
+    for (i = 0; i < k; ++i) {
+      change[i] = fabs(rate[i]) <= arm->numbers.largest ? rate[i] * period : 0.0;
+      state->offset[i] += change[i];
+      state->reference.velocity[i] *= fmax(0.0, 1.0 - period / rules.stopping);
+      state->reference.acceleration[i] = -state->reference.velocity[i] / rules.stopping;
+    }
     return 0;
   }
   for (i = 0; i < k; ++i) {
@@ -1263,21 +1319,46 @@ ORTHOCAS_API void orthocas_stand(const orthocas_arm *arm, orthocas_state *state,
 
 /* ---- one tick ---- */
 
-/* R27: without a measurement, the command is held for hold_ticks; then it goes to the fallback, and the catcher is to
- * take over. */
+/* An arm that nobody sees is braked as the model foresees it: from its last speeds and the momentum that it got since, at
+ * the catcher's damping. What held it when it stood still holds it again. first: whether it was lost just now. */
+static void brake_unseen(const orthocas_arm *arm, orthocas_state *state, int first, const double *fallback, double period,
+                         double *command, double *work) {
+  const int n = arm->n;
+  double *M = take(&work, n * n), *bias = take(&work, n), *gravity = take(&work, n), *held = take(&work, n * n);
+  int i, j;
+  if (first && !faster_than(arm, state->dq, state->safety->rest_speed, rules.stirring))
+    for (i = 0; i < n; ++i) state->load[i] = state->impulse_from[i] - fallback[i];
+  (void)orthocas_dynamics(arm, state->q, state->dq, M, bias, gravity);
+  copy(held, M, n * n);
+  if (!solve(arm, held, state->momentum, n, 1)) set_zero(state->momentum, n);
+  for (i = 0; i < n; ++i) {
+    state->dq[i] += state->momentum[i];
+    state->q[i] += period * state->dq[i];
+  }
+  (void)orthocas_dynamics(arm, state->q, state->dq, M, bias, gravity);
+  for (i = 0; i < n; ++i) {
+    held[i] = command[i] = fallback[i] + state->load[i] + bias[i] - gravity[i];
+    for (j = 0; j < n; ++j) command[i] -= state->safety->damping * M[i * n + j] * state->dq[j];
+  }
+  (void)cut_command(arm, state, period, command);
+  for (i = 0; i < n; ++i) state->momentum[i] = (command[i] - held[i]) * period;
+}
+
+/* R27: without a measurement, the command is held for hold_ticks; then the catcher is to take over, and stops the arm. */
 static void tick_without_measurement(const orthocas_arm *arm, orthocas_state *state, const orthocas_gains *gains,
                                      double period, double *command, double *work) {
-  if (state->bad_ticks < state->safety->hold_ticks) {
-    ++state->bad_ticks;
-    copy(command, state->command, arm->n);
-  } else {
-    if (state->mode == ORTHOCAS_LAW || state->mode == ORTHOCAS_RETURN)
-      catch_arm(arm, state, ORTHOCAS_BAD_INPUT, state->q);
-    state->weight = 0.0;
-    fallback_at(arm, state->q, gains->used, command);
-    if (state->fresh == 2) learn_from_start(arm, state, gains, gains->used, work);
-    if (arm->torque) add_load(arm, state, 1.0, command);
-  }
+  const int hold = state->safety->hold_ticks, lost = state->bad_ticks >= hold;
+  const int first = state->bad_ticks < hold + later(0, period);
+  double *fallback = take(&work, arm->n);
+  fallback_at(arm, state->q, gains->used, fallback);
+  copy(command, lost ? fallback : state->command, arm->n);
+  if (lost && (state->mode == ORTHOCAS_LAW || state->mode == ORTHOCAS_RETURN))
+    catch_arm(arm, state, ORTHOCAS_BAD_INPUT, state->q);
+  if (lost) state->weight = 0.0;
+  if (lost && state->fresh == 2) learn_from_start(arm, state, gains, gains->used, work);
+  if (lost && arm->torque) brake_unseen(arm, state, first, fallback, period, command, work);
+  else watch_sensors(arm, state, fallback, command, period);
+  state->bad_ticks = later(state->bad_ticks, period);
   (void)cut_command(arm, state, period, command);
   copy(state->command, command, arm->n);
 }
@@ -1343,10 +1424,14 @@ ORTHOCAS_API int orthocas_step(const orthocas_arm *arm, orthocas_state *state, i
   if (state->fresh) settle(arm, state, here, room, work);
   status = arm->kernels.control(shared, here, speed, &shifted, gains->used, law);
   fallback_at(arm, here, gains->used, fallback);
-  for (i = 0; i < n && works(status); ++i) state->law[i] = law[i] - fallback[i];
-
   /* Who commands, and the command. */
   choose_mode(arm, state, status, here, speed, clear, room, error, since, late, work);
+  for (i = 0; i < n; ++i) { /* a law that made joints fast gets no more than it had */
+    const double had = state->command[i] - fallback[i];
+    if (works(status)) state->law[i] = law[i] - fallback[i];
+    if (state->mode == ORTHOCAS_CATCHER && state->cause == ORTHOCAS_TOO_FAST)
+      state->law[i] = fmin(fmax(state->law[i], fmin(had, 0.0)), fmax(had, 0.0));
+  }
   if (works(status) && state->mode == ORTHOCAS_LAW && room >= safety->return_margin + rules.room)
     copy(state->safe, here, n); /* the law works here */
   if (arm->torque)

@@ -74,6 +74,8 @@ typedef struct {
   /* J J^T (m, m) of the task, scaled, and the volume of the coordinates, in shares of the median. */
   void (*gram)(const double *q, double *gram);
   double (*room_to_fold)(const double *q);
+  /* NAME_distance: how far links are apart. */
+  int (*gap_of_links)(const double *q, double *gap, double *gradient, double *points, int *pair);
 } orthocas_kernels;
 
 /* A part of the boundary beside the box, for supervision. None: lines and span are 0. */
@@ -128,6 +130,7 @@ typedef struct {
   int shared, memory;                    /* numbers of `shared`, and of NAME_memory */
   int memory_torque;                     /* where NAME_memory has a torque (n,) that the first command shows; or -1 */
   int turned_first, turned_end;          /* components of x that are an orientation; equal: none */
+  double contact_margin;                 /* what links keep of each other [m] */
   const int *bounded, *turning;          /* joints with boundaries of the domain; joints that turn without end (n,) */
   const double *unit;                    /* of distances to the boundaries (n,) */
   const double *turns;                   /* periods of joints in NAME_control (n,), 0: none; null: no joint turns */
@@ -157,7 +160,7 @@ typedef struct {
   double weight, brake, unseen, hasty;
   double *q, *dq, *seen_q, *seen_dq, *command, *led, *impulse, *impulse_from, *law, *anchor, *safe, *limit; /* (n,) */
   double *offset, *integral;                                                                                /* (k,) */
-  double *load, *drive, *speed, *expected, *unexplained;                     /* (n,), null for velocity laws */
+  double *load, *drive, *speed, *expected, *unexplained, *momentum, *trend;  /* (n,), null for velocity laws */
   double *inertia;                                                           /* (n, n), null for velocity laws */
   double *memory;                                                            /* (memory,) or null */
   orthocas_reference reference;
@@ -178,7 +181,7 @@ typedef struct {
 #define ORTHOCAS_NEAREST_WORK(n, rooms)                                                                               \
   (4 * (n) * (n) + 14 * (n) + 4 * (rooms) + 3 * (n) * (rooms) + (2 * (n) + (rooms)) * (2 * (n) + (rooms) + 1))
 #define ORTHOCAS_NEAREST_HELD(n, rooms) ((n) + (rooms))
-#define ORTHOCAS_LAW_WORK(n, k, shared, memory) (2 * (n) * (n) + 10 * (n) + 9 * (k) + (shared) + (memory))
+#define ORTHOCAS_LAW_WORK(n, k, shared, memory) (3 * (n) * (n) + 10 * (n) + 9 * (k) + (shared) + (memory))
 
 /* Of phi, in searches without a bound of the caller. */
 #define ORTHOCAS_EVALUATIONS 100

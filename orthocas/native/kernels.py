@@ -10,9 +10,12 @@ from itertools import pairwise
 import casadi as ca
 import numpy as np
 
-from orthocas.codegen.rendering import render
-from orthocas.control.linear_algebra import LARGE_INVERSE, ROOT_TIMES, ROUNDS
 from orthocas.errors import CompileError
+from orthocas.native.rendering import render
+
+LARGE_INVERSE = "large_inverse"  #: name of the functions for which generated C has code of its own
+ROOT_TIMES = "root_times"  #: likewise
+ROUNDS = 8  #: accurate to rounding up to a condition number of 1e6 (tests/control/test_control_algebra.py)
 
 _VERSION = f"by CasADi {ca.CasadiMeta.version()}"
 _PLACE = re.compile(r"\*w(\d+)=w\+(\d+)")

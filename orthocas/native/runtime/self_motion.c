@@ -1,6 +1,6 @@
 /* The self-motion curves of a task value, r = 1: ways to x, the curves there whatever the limits, and where limits cut
- * them. task_curves.c includes it behind the kernels, tables and rules of a task; orthocas.arms.kernel says what is done
- * and why. */
+ * them. task_curves.c and chart_motion.c include it behind the kernels, tables and rules of a task, and goes_on, which says
+ * whether a curve is followed beyond a point; orthocas.arms.kernel says what is done and why. */
 #define M (N - 1)
 
 #include "curve_math.c"
@@ -182,16 +182,6 @@ static double length_of(const node *a, const node *b) {
   return length;
 }
 
-/* Whether sliding joints are in their ranges, or not far outside. */
-static int slides_near(const double *q) {
-  int i;
-  for (i = 0; i < N; ++i) {
-    const double room = PRISMATIC * (high[i] - low[i]);
-    if (!turning[i] && isfinite(room) && (q[i] < low[i] - room || q[i] > high[i] + room)) return 0;
-  }
-  return 1;
-}
-
 /* Follow the curve from nodes[0] along its tangent, or against it. Returns the number of nodes; *closed is 1 if the last
  * is the first, up to full turns. Against the tangent, the nodes have it reversed. */
 static int follow(node *nodes, int most, const double *target, double sense, int *closed) {
@@ -240,7 +230,7 @@ static int follow(node *nodes, int most, const double *target, double sense, int
       *closed = 1;
       break;
     }
-    if (!slides_near(next->q)) break;
+    if (!goes_on(next->q)) break;
     h *= fmin(1.6, fmax(0.5, cbrt(fmin(AIM, TIGHT * h) / fmax(missed, 1e-9))));
     h = fmin(h, STEP);
     if (turned < STRAIGHT) h = fmin(h, h_before);
