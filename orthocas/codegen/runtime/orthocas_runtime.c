@@ -725,7 +725,7 @@ static int later(int ticks, double period) {
 static int plausible(const orthocas_arm *arm, const orthocas_state *state, const double *q, const double *dq,
                      double period) {
   const orthocas_safety *safety = state->safety;
-  const double since = period * (1.0 + (double)state->bad_ticks / later(0, period));
+  const double since = period * (1.0 + (double)state->bad_ticks / (double)later(0, period));
   int i, odd = faster_than(arm, dq, safety->speed_limit, rules.implausible);
   for (i = 0; i < arm->n; ++i)
     if (state->bad_ticks < safety->hold_ticks &&
