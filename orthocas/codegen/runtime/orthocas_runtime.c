@@ -848,7 +848,7 @@ static int stops_clear(const orthocas_arm *arm, const orthocas_safety *safety, c
   double *ahead = take(&work, arm->n);
   int i, k, clear = 1;
   for (k = 1; k <= 2 && clear; ++k) {
-    for (i = 0; i < arm->n; ++i) ahead[i] = q[i] + 0.5 * k * time * dq[i];
+    for (i = 0; i < arm->n; ++i) ahead[i] = q[i] + 0.5 * (double)k * time * dq[i];
     clear = contact_room(arm, ahead, work) > 0.0;
   }
   return clear;
