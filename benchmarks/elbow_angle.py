@@ -1,10 +1,11 @@
-"""The shoulder-elbow-wrist angle as the coordinate of a pose task: how far it leans into the task (3 min).
+"""The shoulder-elbow-wrist angle as the coordinate of a pose task: how far it leans into the task (6 min).
 
 First the 7-DoF arm with the pose of its flange on the paper's cube, A = I. The leak is the angle between d xi and the
 space orthogonal to the task gradients (0 for exact coordinates, 90 degrees for a function of the task); the paper's
 cosines compare d xi with one task gradient at a time, and are smaller. Fits have the weights of
 `compare_parametrisations.py`. Then three arms on the domain of the wide chart of the home's branch, in both metrics:
-leak, and the speed of the joints with xi held over the least one, for nine in ten velocities of the task.
+leak, and the speed of the joints with xi held over the least one, for nine in ten velocities of the task. Then
+networks on the same branches with A = I, where `fit_wide` by itself takes polynomials.
 """
 
 import casadi as ca
@@ -31,6 +32,10 @@ WIDE = (
     "| stereographic SEW, leak rms [deg] | fitted, speed | conventional SEW, speed | stereographic SEW, speed |\n|"
     + " --- |"
     * 8
+)
+NETWORKS = (
+    "| arm, A = I | default: regular share | leak rms [deg] | network of 24, without the last joint | leak rms [deg] "
+    "| network of 64, without it | leak rms [deg] | network of 64, all joints | leak rms [deg] |\n|" + " --- |" * 9
 )
 WEIGHTS = oc.Weights(folds=0.0, angles="paper")
 
@@ -67,8 +72,20 @@ def whole_branch(name: str, metric: str, quick: bool) -> str:
     return f"| {names} | {percent(fit.regular_share, 3)} | {' | '.join(cells)} |"
 
 
+def networks(name: str, quick: bool) -> str:
+    """One row: regular share and leak with A = I of the default, and of networks with and without the last joint."""
+    robot = robot_of(name)
+    last = robot.joint_names[-1:]
+    families = [None] if quick else [None, *(oc.MLP((k, k, k), True, without=last) for k in (24, 64))]
+    families += [] if quick else [oc.MLP((64, 64, 64), True)]
+    fits = [oc.fit_wide(robot, oc.Task.pose(robot), parametrisation=family) for family in families]
+    leaks_of = [oc.evaluate(fit.chart, 2_000 if quick else 20_000).leak.rms for fit in fits]
+    cells = [f"{percent(fit.regular_share, 3)} | {leak:.1f}" for fit, leak in zip(fits, leaks_of, strict=True)]
+    return f"| {name} | {' | '.join(cells)} |"
+
+
 def main(quick: bool = False) -> dict[str, dict[str, float]]:
-    """Print two tables; return the figures of the first one by coordinate."""
+    """Print three tables; return the figures of the first one by coordinate."""
     arm, found = oc.problems.get("iiwa"), {}
     task = oc.Task.named(arm.robot, "pose", arm.domain.centre)
     problem = oc.Problem(arm.robot, task, "euclidean", arm.domain)
@@ -86,6 +103,7 @@ def main(quick: bool = False) -> dict[str, dict[str, float]]:
         print(f"| {name} | {' | '.join(f'{value:.1f}' for value in found[name].values())} |", flush=True)
     cases = [(name, metric) for name in ARMS for metric in METRICS]
     table(WIDE, (whole_branch(*case, quick) for case in (cases[1:2] if quick else cases)))
+    table(NETWORKS, (networks(name, quick) for name in ARMS[: 1 if quick else None]))
     return found
 
 
