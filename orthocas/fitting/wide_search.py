@@ -96,7 +96,7 @@ class WideRules:
 
 
 RULES = WideRules()
-_ADAM = Adam(epochs=8, steps=500, batch=256, learning_rate=1e-2)
+_ADAM = Adam(epochs=8, steps=500, batch=512, learning_rate=1e-2)
 # Adam once the worst of fresh samples have joined
 _SLOWER = replace(_ADAM, learning_rate=5e-3)
 _SLOWER_OF_SMALL = replace(_SLOWER, epochs=5)
@@ -200,7 +200,7 @@ class Search:
         wide = int(np.clip(RULES.per_term * self.family.width, RULES.least_samples, RULES.most_samples))
         of_networks = RULES.small_network_samples if self.left_out else RULES.network_samples
         self.samples = settings.samples or (wide if self.linear else of_networks)
-        self.solver: Solver = LBFGS(RULES.iterations, RULES.tolerance) if self.linear else _ADAM
+        self.solver: Solver = LBFGS(RULES.iterations, RULES.tolerance) if self.linear else self._of_batch(_ADAM)
         self.best: Array | None = None  #: parameters, (size,)
         #: of the best: whether they miss the centre, fraction of bad positions, if too many, and minus their 1 % volume
         self.rank = (True, np.inf, np.inf)
@@ -228,6 +228,7 @@ class Search:
                 # networks of all joints are led by those of A = I: from a random start, some would stay folded
                 plain = Problem(problem.robot, problem.task, "euclidean", problem.domain, problem.name)
                 leader = Search(plain, self.parametrisation, self.settings)
+                leader.solver = self.solver
                 leader.begin(f"{name}, A = I")
                 self._last, self.stages = leader._last, leader.stages
             self._descend(name, "volume with the worst", self.solver)
@@ -247,10 +248,10 @@ class Search:
                 solver: Solver = LBFGS(RULES.further, RULES.tolerance)
             elif self.left_out:
                 self._add_worst(RULES.fresh_of_small_networks, RULES.worst_of_small_networks, RULES.fresh_tag + turn)
-                solver = _SLOWER_OF_SMALL
+                solver = self._of_batch(_SLOWER_OF_SMALL)
             else:
                 self._add_worst(RULES.fresh_of_networks, RULES.worst_of_networks, RULES.fresh_tag + turn)
-                solver = _SLOWER
+                solver = self._of_batch(_SLOWER)
             self._descend(f"worst samples, round {turn}", "volume with the worst", solver)
         # The gradient comes nearer to self-motions, if it stays regular enough. A user's balance of terms is kept.
         balanced = self.settings.weights or self.settings.quantities
@@ -258,10 +259,14 @@ class Search:
         if finished and self._last is self.best and not balanced:
             self._alignment *= RULES.closer if self.problem.r == 1 else RULES.closer_of_several
             first = self.linear and len(self._samples) == 1
-            solver = LBFGS(RULES.further, RULES.tolerance) if self.linear else _SLOWER_OF_SMALL
+            solver = LBFGS(RULES.further, RULES.tolerance) if self.linear else self._of_batch(_SLOWER_OF_SMALL)
             rank = self._descend("smaller leaks", "volume" if first else "volume with the worst", solver)
             if self._done or (not self.linear and not rank[0] and rank[1] <= RULES.enough):
                 self.best, self.rank = self._last, rank
+
+    def _of_batch(self, solver: Adam) -> Adam:
+        """The solver with the samples of a step: with A = I, half of them would leave out 1 % more of random arms."""
+        return solver if self.problem.metric.is_identity else replace(solver, batch=solver.batch // 2)
 
     def is_enough(self, bad: float) -> bool:
         """Whether the best coordinates are regular at the centre, and at most at a fraction of samples not."""
