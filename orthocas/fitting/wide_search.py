@@ -225,7 +225,8 @@ class Search:
             if problem.metric.is_identity or problem.r > 1 or self.left_out:
                 self._last = self._start_at_random()
             else:
-                # networks of all joints are led by those of A = I: from a random start, some would stay folded
+                # networks of all joints are led by those of A = I: from a random start, some would stay folded;
+                # a rough leader serves
                 plain = Problem(problem.robot, problem.task, "euclidean", problem.domain, problem.name)
                 leader = Search(plain, self.parametrisation, self.settings)
                 leader.solver = self.solver
