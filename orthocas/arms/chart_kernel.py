@@ -332,14 +332,13 @@ def write_tracker(
         winds = np.any([chart.parts.boxed.winding for chart in charts], axis=0)
         home, endless = charts[0].problem.domain.home, np.isinf(robot.lower)
         around = [home + np.where(winds, sign * 3 * np.pi, sign * np.inf) for sign in (-1, 1)]
-        values["lift_low"] = np.where(endless, np.maximum(lows.min(axis=0), around[0]), robot.lower)
-        values["lift_high"] = np.where(endless, np.minimum(highs.max(axis=0), around[1]), robot.upper)
-        values["winds"] = winds
+        lift_low = np.where(endless, np.maximum(lows.min(axis=0), around[0]), robot.lower)
+        lift_high = np.where(endless, np.minimum(highs.max(axis=0), around[1]), robot.upper)
         # All combinations of full turns find room, so that none is dropped.
-        ranges = np.where(maps.turning, values["lift_high"] - values["lift_low"] + 2 * RULES.room, 0.0)
+        ranges = np.where(maps.turning, lift_high - lift_low + 2 * RULES.room, 0.0)
         lifts = np.prod(np.floor(ranges[np.isfinite(ranges)] / (2 * np.pi)) + 1)
         if lifts > RULES.lifts:
             raise InvalidValueError("limits", f"{lifts:.0f} combinations of full turns", f"at most {RULES.lifts}")
-        values["lifts"] = int(lifts)
+        values |= {"lift_low": lift_low, "lift_high": lift_high, "winds": winds, "lifts": int(lifts)}
     source = f"{name}_track.c" if template == "arm_track.c" else f"{name}.c"
     return {f"{name}_track.h": render("arm_track.h", values), source: render(template, values)}

@@ -1,13 +1,17 @@
 """Text from templates, with numbers as they stand in C."""
 
+from __future__ import annotations
+
 from collections.abc import Iterable, Mapping
 from functools import cache
 from importlib.resources import files
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from jinja2 import Environment, PackageLoader, StrictUndefined, pass_context
-from jinja2.runtime import Context
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+    from jinja2.runtime import Context
 
 _INFINITIES = {np.inf: "INFINITY", -np.inf: "-INFINITY"}
 
@@ -25,6 +29,8 @@ def get_source(name: str, package: str = __package__) -> str:
 @cache
 def _environment(package: str) -> Environment:
     """Blocks vanish with their lines; `x | numbers` are literals of C, `x | array` and `x | strings` initialisers."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined, pass_context  # charts load without it
+
     # Missing names are errors, and generated text is not HTML.
     environment = Environment(
         loader=PackageLoader(package, "templates"),
@@ -36,7 +42,7 @@ def _environment(package: str) -> Environment:
     )
     environment.filters |= {"numbers": write_numbers, "array": lambda values: f"{{{write_numbers(values)}}}"}
     environment.filters["strings"] = lambda words: f"{{{', '.join(map(_quote, words))}}}"
-    environment.filters["code"] = _translate
+    environment.filters["code"] = pass_context(_translate)
     return environment
 
 
@@ -45,7 +51,6 @@ def _quote(word: str) -> str:
     return '"' + word.replace('"', "'") + '"'
 
 
-@pass_context
 def _translate(context: Context, text: str) -> str:
     """Python for NumPy as that of the template's library."""
     return str(context["library"].translate(text))

@@ -114,7 +114,7 @@ HOSTILE = (
 
 
 @pytest.mark.slow
-def test_names_from_robot_files_stay_in_comments(tmp_path: Path) -> None:
+def test_names_from_robot_files_stay_in_comments_and_strings(tmp_path: Path) -> None:
     """Keywords, quotes, trigraphs, bidi characters and backslashes at ends of lines, with trigraphs switched on too."""
     robot = oc.Robot.planar([0.5] * len(HOSTILE), [1.0] * len(HOSTILE))
     names = tuple(one_line(name) for name in HOSTILE)
@@ -129,7 +129,9 @@ def test_names_from_robot_files_stay_in_comments(tmp_path: Path) -> None:
         assert "??" not in text
         comments = re.findall(r"/\*.*?\*/", text, flags=re.DOTALL)
         assert not any("\\" in comment for comment in comments)
-        assert not any("evil" in part for part in re.sub(r"/\*.*?\*/", "", text, flags=re.DOTALL).splitlines())
+        code = re.sub(r"/\*.*?\*/", "", text, flags=re.DOTALL)
+        assert "\\" not in "".join(re.findall(r'"[^"\n]*"', code))
+        assert "evil" not in re.sub(r'"[^"\n]*"', "", code)
     for dialect in ("-std=c99", "-std=gnu17"):  # strict C99 reads trigraphs
         flags = (*STRICT, dialect, "-Wtrigraphs", "-Wcomment")
         command = [find_compilers()[0], *flags, "-c", str(source), "-o", "/dev/null"]

@@ -133,7 +133,7 @@ def test_an_arm_that_sinks_within_its_domain_is_lost_too(planar_chart: oc.Chart,
     assert run.reason.startswith("from t = 0 s to 0.3 s joint ")
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_a_supervised_law_that_falls_into_its_catcher_is_lost() -> None:
     chart = oc.charts.load("pr2-left-wide")
     law, centre = quietly(PDPlus.on_chart, chart), chart.problem.domain.centre

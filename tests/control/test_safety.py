@@ -71,6 +71,7 @@ def test_faults_do_not_make_an_arm_run_away(tiago: faults.Arm, bits: int) -> Non
     assert faults.blow(arm)[1] < 0.5
 
 
+@pytest.mark.nightly
 def test_the_observer_keeps_torques_of_coarse_encoders_below_their_rate() -> None:
     """At 13 bits; also with masses 20 % off and torques 5 ms late, and after a push."""
     with faults.arm_of("panda-position") as arm:

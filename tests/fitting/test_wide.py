@@ -875,7 +875,7 @@ def test_coordinates_of_the_other_sense_in_the_middle_miss_it() -> None:
     assert search.rank[0]
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_networks_are_regular_on_a_whole_box() -> None:
     known, network = oc.problems.get("planar_3r_xy"), oc.MLP((16, 16), raw=True)
     wide = oc.Box([0.0, 0.9, 0.9], [3.0, 1.3, 1.3])

@@ -56,6 +56,13 @@ def test_all_scenarios_have_a_thread_and_streams_that_begin_at_home() -> None:
             assert np.abs(first).max() < 2e-2, name
 
 
+def test_what_is_stored_is_of_the_same_methods_in_all_scenarios() -> None:
+    """Rows of trials do not stay among those that were measured."""
+    stored = {name: json.loads((runner.RESULTS / f"{name}.json").read_text()) for name in runner.scenarios()}
+    assert len({frozenset(result["methods"]) for result in stored.values()}) == 1
+    assert {"arm", "chart, wide", "SEW angle"} < set(stored["drift"]["methods"])
+
+
 def test_a_package_that_is_missing_has_a_row_that_says_so(tmp_path: Path) -> None:
     path = tmp_path / "absent.py"
     path.write_text("import no_such_package_here\n")

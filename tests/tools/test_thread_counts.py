@@ -201,3 +201,24 @@ def test_processes_with_one_and_two_threads_find_the_same(tmp_path: Path) -> Non
         assert len(one.files) == 5
         for name in one.files:
             np.testing.assert_allclose(two[name], one[name], rtol=0, atol=1e-12 * np.abs(one[name]).max())
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform != "linux", reason="of glibc")
+def test_workers_of_a_scheduler_keep_freed_memory() -> None:
+    """Dask starts workers with a low threshold; each freed array was mapped anew, page by page."""
+    code = (
+        "import resource; import numpy as np; from orthocas.tools.processes import keep_freed_memory\n"
+        "keep_freed_memory() if {} else None\n"
+        "for _ in range(300): np.ones(100_000)\n"
+        "before = resource.getrusage(resource.RUSAGE_SELF).ru_minflt\n"
+        "for _ in range(300): np.ones(100_000)\n"
+        "print(resource.getrusage(resource.RUSAGE_SELF).ru_minflt - before)"
+    )
+    environment = os.environ | {"MALLOC_TRIM_THRESHOLD_": "65536"}
+    faults = []
+    for keep in (True, False):
+        words = [sys.executable, "-c", code.format(keep)]
+        faults.append(int(subprocess.run(words, env=environment, capture_output=True, check=True).stdout))
+    assert faults[0] < 1000
+    assert faults[1] > 10_000
