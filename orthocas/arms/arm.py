@@ -685,6 +685,8 @@ class Arm(Shown):
                 left = np.full(len(q), np.nan)
                 if near.size:
                     left[near] = miss(q[near])
+                # At an end of an arc, rounding must not decide on which side of xi it lies.
+                left[np.abs(left) < RULES.met] = 0.0
                 # A change of sign between two places has a posture with this xi, unless xi jumps by its period there.
                 # Only that posture need lie in the domain, of which the arc may pass a short part.
                 crosses = left[:-1] * left[1:] <= 0

@@ -433,7 +433,8 @@ class Inverse:
 
     def _search(self, targets: Array, starts: Array | None, tolerance: float, inside: bool) -> Found:
         """What the search finds from given starts, or from the rough inverse and, where that fails, in the domain."""
-        follows = inside or (self.curves is not None and starts is None)
+        # Where a longer search follows in any case, as with `inside`, so that both begin it at the same places.
+        follows = inside or (starts is None and (self.curves is not None or not self.problem.domain.is_box))
         first = self.local if self.brief is None or not follows else self.brief
         best = self._attempt(targets, self.starts.guess(targets) if starts is None else starts, tolerance, first)
         # most rows end here
@@ -449,10 +450,14 @@ class Inverse:
                 self._search_curves(self.curves, self.inside, targets, best, own, tolerance)
             else:
                 self._search_inside(self.inside, targets, best, own, tolerance)
+                # Descents in a box find solutions that slides in it miss.
+                if self.problem.domain.is_box:
+                    self._search_domain(targets, best, own, tolerance)
         elif starts is None:
+            own = best.q.copy()
             if self.curves is None:
                 self._restart(targets, best, self._open(best), RULES.first, InverseStatus.FOUND, tolerance)
-            self._search_domain(targets, best, self._open(best), tolerance)
+            self._search_domain(targets, best, own, tolerance)
             rows = np.flatnonzero(best.status == InverseStatus.NOT_FOUND)
             self._restart(targets, best, rows, RULES.restarts, InverseStatus.SINGULAR, tolerance)
         elif self.along is not None:
@@ -464,11 +469,12 @@ class Inverse:
         """Rows that may have another solution, inside the domain."""
         return np.flatnonzero(~np.isin(best.status, (InverseStatus.FOUND, InverseStatus.OUT_OF_REACH)))
 
-    def _search_domain(self, targets: Array, best: Found, rows: Indices, tolerance: float) -> None:
-        """Search all of the domain in some rows."""
+    def _search_domain(self, targets: Array, best: Found, own: Array, tolerance: float) -> None:
+        """Search all of the domain in rows that are not found: from q (N, n), as with `inside`, or stored positions."""
+        rows = self._open(best)
         # r = 1: all self-motion curves of x are known, so a root on them is a solution
         if rows.size and self.curves is not None:
-            near = self.curves.search(targets[rows], best.q[rows], tolerance)
+            near = self.curves.search(targets[rows], own[rows], tolerance)
             found = near.distance == 0
             rows, q = rows[found], near.q[found]
             solved = np.full(len(q), int(InverseStatus.FOUND))
@@ -479,7 +485,7 @@ class Inverse:
         if self.problem.domain.is_box:
             q = self.in_domain.search(targets[rows], tolerance)[0]
         else:  # it may be a small part of its box, and most cells lie outside
-            q = self.inside.nearest(targets[rows], best.q[rows])[0]
+            q = self.inside.nearest(targets[rows], own[rows])[0]
         # other coordinates: the best point of the cells, or near stored ones
         attempt = Attempt(q, self.phi_map.residual(targets[rows], q), best.iterations[rows], np.ones(len(q), bool))
         best.improve(rows, self._evaluate(attempt, tolerance))

@@ -335,12 +335,16 @@ class LevelCurve:
         if not np.isfinite(t).all():
             return Branch(q[None], np.zeros(1), Stop(StopKind.SINGULAR), self._chart.xi(q)[None])
         points, tangents, steps, stop = [q[None]], [t[None]], [(q, t)], None
-        for new, onward, ended in self._step_on(target, q, t):
+        for new, onward, last in self._step_on(target, q, t):
+            ended = last
             steps.append((new, onward))
             # many long steps are divided and looked at together, as the box cannot be left before its faces
             if ended is None and len(steps) <= RULES.at_once and self.walls.box_has(new):
                 continue
             ahead, turned = self._divide(target, *(np.array(part) for part in zip(*steps, strict=True)))
+            # Grown charts may end between two steps.
+            if not (known := np.isfinite(ahead).all(axis=1) & np.isfinite(turned).all(axis=1)).all():
+                ahead, turned, ended = *(part[: np.argmin(known)] for part in (ahead, turned)), Stop(StopKind.SINGULAR)
             ahead, turned, stop = self._find_end(target, ahead, turned, signs) or (ahead, turned, ended)
             points.append(ahead[1:])
             tangents.append(turned[1:])
@@ -380,11 +384,18 @@ class LevelCurve:
         if not (missed < RULES.missed * min(1.0, h / RULES.step) and onward @ t > RULES.sharpest):
             return None
         # What is left of an error would stand beside the next step, however short that becomes.
-        return self._settle(target, ahead + change, onward)
+        point, tangent = self._settle(target, ahead + change, onward)
+        return (point, tangent) if np.isfinite(point).all() else None
 
     def _correct(self, target: Array, q: Array, t: Array) -> tuple[Array, Array]:
         """Newton's steps (N, n) from points q (N, n) across directions t (N, n), and unit tangents, on their side."""
         if self._with_xi:
+            # Points that have left a grown chart are NaN, which it refuses.
+            if not (known := np.isfinite(q).all(axis=1)).all():
+                both = np.full((2, *q.shape), np.nan)
+                if known.any():
+                    both[:, known] = self._correct(target, q[known], t[known])
+                return both[0], both[1]
             phi_map, held = self._chart.parts.phi_map, self._held
             targets, n = np.broadcast_to(target, q.shape), q.shape[1]
             bordered, right = np.empty((len(q), n, n)), np.zeros((len(q), n, 2))
@@ -442,6 +453,8 @@ class LevelCurve:
 
     def _margin(self, q: Array, t: Array, signs: Signs | None) -> float:
         """Positive before the end of the curve, negative beyond it, and where nothing is finite."""
+        if not np.isfinite(q).all():
+            return -1.0
         fold = np.inf if signs is None else float(signs(q[None], t[None])[0])
         margin = float(np.append(self.walls.values(q), fold).min())
         return -1.0 if np.isnan(margin) else margin
@@ -463,6 +476,8 @@ class LevelCurve:
         point, onward = self._settle(target, q[0] + max(0.0, s - 2 * RULES.rounding) * t, t)
         # What ends the curve is told just beyond its end: a domain that only answers `contains` has no slope inside.
         beyond, further = self._settle(target, q[0] + min(h, s + 2 * RULES.rounding) * t, t)
+        if not np.isfinite(beyond).all():
+            return point, onward, Stop(StopKind.SINGULAR)
         values = self.walls.values(beyond)
         if signs is not None and float(signs(beyond[None], further[None])[0]) < values.min():
             return point, onward, Stop(StopKind.FOLD)
@@ -473,7 +488,7 @@ class LevelCurve:
         for _ in range(RULES.corrections):
             change, onward = (part[0] for part in self._correct(target, q[None], t[None]))
             q = q + change
-            if np.abs(change).max() < RULES.settled:
+            if not np.abs(change).max() >= RULES.settled:
                 break
         return q, onward
 

@@ -31,7 +31,7 @@ def keep_library(kind: str, sources: Mapping[str, str], flags: Sequence[str], fo
         folder: where libraries are kept; default `orthocas/libraries` in $XDG_CACHE_HOME or ~/.cache.
 
     Raises:
-        CompileError: if there is no C compiler, or it fails, or the folder is not the user's own.
+        CompileError: if there is no C compiler, or it fails, or there is no folder of the user's own.
         InvalidValueError: if the folder cannot be written.
     """
     compiler, options = _choose_compiler(), ("-std=c99", "-fPIC", "-shared", *flags)
@@ -49,6 +49,8 @@ def keep_library(kind: str, sources: Mapping[str, str], flags: Sequence[str], fo
             included = {name for text in sources.values() for name in _INCLUDED.findall(text)}
             code = [str(place / file) for file in sources if file.endswith(".c") and file not in included]
             run_program([*compiler, *options, "-o", str(drafts / name), *code, "-lm"])
+            if not (drafts / name).is_file():
+                raise CompileError(f"{' '.join(compiler)} wrote no library, expected a compiler of C")
             (drafts / f"{name}.sha256").write_text(compute_digest(drafts / name))
     return library
 
@@ -84,10 +86,17 @@ def find_compilers() -> tuple[str, ...]:
 
 
 def _find_cache() -> Path:
-    """Where libraries are kept by default."""
+    """Where libraries are kept by default.
+
+    Raises:
+        CompileError: if the user has no home.
+    """
     # Relative paths in XDG_CACHE_HOME do not count, as its specification demands.
     place = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    return (place if place.is_absolute() else Path.home() / ".cache") / "orthocas" / "libraries"
+    try:
+        return (place if place.is_absolute() else Path.home() / ".cache") / "orthocas" / "libraries"
+    except RuntimeError:
+        raise CompileError("no folder for compiled libraries: this user has no home, set XDG_CACHE_HOME") from None
 
 
 def load_library(library: Path) -> ctypes.CDLL:

@@ -33,7 +33,7 @@ def read_mjcf(source: Any, locked: Mapping[str, float] | None = None) -> tuple[p
 
     Args:
         source: the path of a file, or a `mujoco.MjModel`.
-        locked: joints that the caller locks: couplings in MuJoCo yield, so these follow no more.
+        locked: joints that the caller locks: couplings in MuJoCo yield, so these follow no more, but are followed.
 
     Raises:
         MissingExtraError: if MuJoCo is not installed.
@@ -45,8 +45,7 @@ def read_mjcf(source: Any, locked: Mapping[str, float] | None = None) -> tuple[p
         compiled, name = source, "the model"
     else:
         compiled, name = compile_mjcf(source), str(as_path("path", source))
-    mimics = _find_mimics(mujoco, compiled)
-    return _convert(mujoco, compiled, name), {k: mimic for k, mimic in mimics.items() if k not in (locked or {})}
+    return _convert(mujoco, compiled, name), _find_mimics(mujoco, compiled, locked or {})
 
 
 def compile_mjcf(path: Any) -> Any:
@@ -88,7 +87,7 @@ def _convert(mujoco: Any, compiled: Any, name: str) -> pin.Model:
     return model
 
 
-def _find_mimics(mujoco: Any, compiled: Any) -> dict[str, Mimic]:
+def _find_mimics(mujoco: Any, compiled: Any, locked: Mapping[str, float]) -> dict[str, Mimic]:
     """Joints that follow others: q1 - ref1 = a0 + a1 (q2 - ref2), where MuJoCo's polynomial has no higher terms."""
     direct = {}
     for i in range(compiled.neq):
@@ -98,6 +97,8 @@ def _find_mimics(mujoco: Any, compiled: Any) -> dict[str, Mimic]:
         if not coupled or any(higher) or not a1:
             continue
         names = [compiled.joint(k).name or f"joint{k}" for k in (first, second)]
+        if names[0] in locked:
+            continue
         ref1, ref2 = (float(compiled.qpos0[compiled.jnt_qposadr[k]]) for k in (first, second))
         direct[names[0]] = Mimic(names[1], float(a1), ref1 + float(a0) - float(a1) * ref2)
     return resolve_mimics(direct)

@@ -173,10 +173,14 @@ def run_program(command: Sequence[str]) -> str:
     """What a compiler or a program that it made prints. Ctrl-C ends it with all that it started, as gcc does cc1.
 
     Raises:
-        CompileError: if it fails; the message has the first lines of its complaint.
+        CompileError: if it fails or cannot start; the message has the first lines of its complaint.
     """
     group, pipe = 0 if hasattr(os, "killpg") else None, subprocess.PIPE
-    with subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, process_group=group) as program:
+    try:
+        started = subprocess.Popen(command, stdout=pipe, stderr=pipe, text=True, process_group=group)
+    except OSError as error:
+        raise CompileError(f"cannot start {command[0]}: {error.strerror}") from None
+    with started as program:
         try:
             said, complaint = program.communicate()
         # Ctrl-C and others: the whole group ends, then the exception goes on

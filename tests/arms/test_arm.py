@@ -265,6 +265,18 @@ def test_full_turns_of_endless_joints_bring_postures_into_a_box() -> None:
     assert np.linalg.norm(near.q - q, axis=1).max() < 0.05
 
 
+def test_postures_at_which_a_closed_curve_begins_are_found() -> None:
+    """Curves of these x begin at the postures themselves, which are stored, and there xi is met up to rounding."""
+    known = oc.problems.get("planar_3r_xy")
+    problem = oc.Problem(known.robot, known.task, domain=oc.Torus(3))
+    chart = oc.fit(problem, oc.Polynomial(2), samples=300).chart
+    arm, missed = oc.Arm(chart.task, (chart,)), 0
+    for q in chart.domain.sample(25, 0):
+        found = arm.solve(arm.x(q), float(chart.xi(q)[0]), all=True).q
+        missed += bool(np.abs(np.exp(1j * found) - np.exp(1j * q)).max(axis=1).min() > 1e-5)
+    assert missed == 0
+
+
 @pytest.mark.slow
 def test_where_full_turns_change_xi_an_arm_finds_as_many_as_its_chart() -> None:
     """All solutions within one and a half turns, as the chart's own search has them."""

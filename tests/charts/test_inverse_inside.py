@@ -4,6 +4,7 @@ from itertools import combinations, product
 
 import casadi as ca
 import numpy as np
+import pytest
 from charts import beyond_domain
 from public_objects import clear
 
@@ -33,6 +34,16 @@ def test_inside_gives_the_nearest_coordinates_that_keep_the_task(planar_arm: oc.
             assert solutions.distance[k] <= least + 1e-9
         else:
             assert len(inner) == 0
+
+
+@pytest.mark.parametrize("name", ["ur5-position", "pr2-left-wide"])
+def test_inside_finds_what_a_search_without_it_finds(name: str) -> None:
+    """r > 1: all of these rows have solutions inside a box; of the part of one, both begin at the same places."""
+    chart = oc.load(name)
+    q = chart.domain.sample(200, 7) if chart.domain.is_box else chart.domain.sample(1200, 11)[620:626]
+    phi = chart.phi(q)
+    assert chart.solve(phi).found.all()
+    assert chart.solve(phi, inside=True).found.all()
 
 
 def self_motion(planar_arm: oc.Chart, x: np.ndarray) -> np.ndarray:

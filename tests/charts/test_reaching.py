@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -60,6 +61,40 @@ def test_c_and_python_end_at_the_same_places(name: str, monkeypatch: pytest.Monk
         assert isinstance(curve, SelfMotionCurve)
         assert (motion.closed, motion.folds) == (curve.closed, curve.folds)
         np.testing.assert_allclose(motion.q[[0, -1]], curve.q[[0, -1]], rtol=0, atol=1e-9)
+
+
+def _raise_for_home() -> Path:
+    raise RuntimeError("Could not determine home directory.")
+
+
+@pytest.mark.parametrize("fault", ["home", "#!/bin/sh\nexit 0\n", "not a program"])
+def test_without_a_library_python_follows_the_curves(
+    fault: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Users without a home, as in containers, and compilers that make nothing or do not start."""
+    if fault == "home":
+        monkeypatch.delenv("XDG_CACHE_HOME", raising=False)
+        monkeypatch.setattr(Path, "home", _raise_for_home)
+    else:
+        (tmp_path / "gcc").write_text(fault)
+        (tmp_path / "gcc").chmod(0o700)
+        monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+        monkeypatch.setenv("PATH", str(tmp_path))
+    chart = oc.load("panda-pose")
+    assert chart.parts.motion_kernel is None
+    assert len(chart.xi_range(chart.domain.centre)) == 1
+
+
+def test_ranges_of_a_grown_chart_end_where_it_ends() -> None:
+    """Of 12 postures one is outside the chart; the curves of the others leave it, or the domain."""
+    chart, ends = disk(), set()
+    for q in chart.domain.sample(12, 0):
+        if np.isfinite(chart.xi(q)).all():
+            ranges = chart.xi_range(q)
+            assert (ranges.low <= chart.xi(q)).all()
+            assert (ranges.high >= chart.xi(q)).all()
+            ends |= {stop.kind for interval in ranges for stop in (interval.low_stop, interval.high_stop)}
+    assert {StopKind.JOINT, StopKind.FOLD, StopKind.SINGULAR} <= ends
 
 
 def test_arc_length_is_that_of_the_closed_form() -> None:

@@ -9,7 +9,8 @@ from laws import torque
 from scipy.linalg import eigvalsh
 
 import orthocas as oc
-from orthocas.control import Impedance, PDPlus, Safety, matched_stiffness
+from orthocas.charts import point_quality
+from orthocas.control import Impedance, PDPlus, Safety, matched_stiffness, operational_space
 from orthocas.control.gains import compute_mobility, limit_stiffness
 from orthocas.errors import (
     InvalidValueError,
@@ -279,3 +280,13 @@ def test_the_fastest_mode_of_a_law_is_the_fastest_on_a_grid_of_its_domain(planar
     assert fastest == modes.frequencies.max()
     assert fastest >= (1 - 1e-6) * np.sqrt(squares.max()) / (2 * np.pi)
     assert fastest > 1.02 * modes.frequencies[:-1].max()  # samples alone do not find it
+
+
+@pytest.mark.nightly
+def test_users_search_for_modes_ends_where_the_brief_one_of_tests_does(
+    planar_chart: oc.Chart, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """tests/conftest.py has laws search from a sixth of the postures."""
+    brief = PDPlus(planar_chart, [200.0, 30.0, 5.0]).integral_bound
+    monkeypatch.setattr(operational_space, "least_in_domain", point_quality.least_in_domain)
+    assert PDPlus(planar_chart, [200.0, 30.0, 5.0]).integral_bound == pytest.approx(brief, rel=1e-3)

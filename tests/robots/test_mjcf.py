@@ -413,6 +413,19 @@ def test_linear_couplings_of_joints_are_mimic_joints(tmp_path: Path) -> None:
     assert oc.Robot.from_mjcf(path, "four", {"c": 0.3}).mimics == ()
 
 
+def test_a_joint_that_follows_a_locked_one_keeps_its_place(tmp_path: Path) -> None:
+    """d follows c, which follows b: with c locked, d is too, wherever b is."""
+    path, second = tmp_path / "chain.xml", '<joint joint1="d" joint2="c" polycoef="0 1 0 0 0"/></equality>'
+    chain = COUPLED.format(coefficients="0 1 0 0 0", active="true").replace("</equality>", second)
+    path.write_text(chain)
+    robot = oc.Robot.from_mjcf(path, "four", {"c": 0.3})
+    assert robot.joint_names == ("a", "b")
+    path.write_text(chain.replace('active="true"', 'active="false"').replace(second, "</equality>"))
+    free = oc.Robot.from_mjcf(path, "four")
+    ref = float(mujoco.MjModel.from_xml_string(chain).qpos0[2])
+    assert_close(robot.tip_rotation([0.1, 0.7]), free.tip_rotation([0.1, 0.7, 0.3, 0.3 - ref]))
+
+
 @pytest.mark.parametrize(("coefficients", "active"), [("0 1 0.2 0 0", "true"), ("0 1 0 0 0", "false")])
 def test_other_equalities_leave_joints_free(coefficients: str, active: str, tmp_path: Path) -> None:
     path = tmp_path / "free.xml"
