@@ -225,11 +225,9 @@ class Search:
             if problem.metric.is_identity or problem.r > 1 or self.left_out:
                 self._last = self._start_at_random()
             else:
-                # networks of all joints are led by those of A = I: from a random start, some would stay folded;
-                # a rough leader serves
+                # networks of all joints are led by those of A = I: from a random start, some would stay folded
                 plain = Problem(problem.robot, problem.task, "euclidean", problem.domain, problem.name)
                 leader = Search(plain, self.parametrisation, self.settings)
-                leader.solver = self.solver
                 leader.begin(f"{name}, A = I")
                 self._last, self.stages = leader._last, leader.stages
             self._descend(name, "volume with the worst", self.solver)
@@ -252,7 +250,7 @@ class Search:
                 solver = self._of_batch(_SLOWER_OF_SMALL)
             else:
                 self._add_worst(RULES.fresh_of_networks, RULES.worst_of_networks, RULES.fresh_tag + turn)
-                solver = self._of_batch(_SLOWER)
+                solver = _SLOWER
             self._descend(f"worst samples, round {turn}", "volume with the worst", solver)
         # The gradient comes nearer to self-motions, if it stays regular enough. A user's balance of terms is kept.
         balanced = self.settings.weights or self.settings.quantities
@@ -266,8 +264,8 @@ class Search:
                 self.best, self.rank = self._last, rank
 
     def _of_batch(self, solver: Adam) -> Adam:
-        """The solver with the samples of a step: with A = I, half of them would leave out 1 % more of random arms."""
-        return solver if self.problem.metric.is_identity else replace(solver, batch=solver.batch // 2)
+        """The solver with the samples of a step: half of them serve small networks, but not those of all joints."""
+        return replace(solver, batch=solver.batch // 2) if self.left_out else solver
 
     def is_enough(self, bad: float) -> bool:
         """Whether the best coordinates are regular at the centre, and at most at a fraction of samples not."""
