@@ -84,7 +84,6 @@ def render_distance(fitted: FittedCapsules, values: Mapping[str, Any], precision
         item["radius"] = up(item["radius"])
     for capsule in capsules:
         capsule["reach"] = up(capsule["reach"])
-    numbers_held = 18 * tree.n + 3 * len(links) + 9 * len(capsules)
     values = {
         **values,
         "n": tree.n,
@@ -112,10 +111,18 @@ def render_distance(fitted: FittedCapsules, values: Mapping[str, Any], precision
             "resolution": RULES.resolution,
             "most": 1 + CLEARANCE.halvings * (1 + RULES.rounds),
         },
-        "stack": precision.size * numbers_held + len(links) + RULES.locals_bytes,
+        "stack": bound_distance_stack(fitted, precision.size),
     }
     files = {f"{values['name']}_distance.{kind}": render(f"distance.{kind}", values) for kind in ("h", "c")}
     return {file: precision.translate(text) for file, text in files.items()}
+
+
+def bound_distance_stack(fitted: FittedCapsules, size: int) -> int:
+    """Bytes of stack of a call of NAME_distance, at most: places of joints, links and capsules in numbers of `size`."""
+    model = fitted.collisions
+    names = [part.name for part in model.parts if part.shape.bounded]
+    links = len(set(names))
+    return size * (18 * model.tree.n + 3 * links + 9 * len(names)) + links + RULES.locals_bytes
 
 
 def build_distance_form(fitted: FittedCapsules) -> Form:

@@ -13,7 +13,7 @@ import numpy as np
 
 from orthocas.charts.chart import Chart
 from orthocas.charts.chart_file import fingerprint
-from orthocas.codegen.distance import render_distance
+from orthocas.codegen.distance import bound_distance_stack, render_distance
 from orthocas.codegen.rendering import (
     DOUBLE,
     SINGLE,
@@ -132,6 +132,9 @@ def generate_c(
     precision = SINGLE if single_precision else DOUBLE
     kernels = generate_kernels(_build_functions(chart, controller, precision), f"{name}_kernel")
     stack_bytes = _bound_stack(kernels, chart, controller, precision.size)
+    # The supervised law asks for the distance of links within a tick.
+    if capsules is not None and controller is not None:
+        stack_bytes += bound_distance_stack(capsules, precision.size)
     values = _describe_library(chart, controller, name, precision, kernels) | {"stack_bytes": stack_bytes}
     values |= {"distances": capsules is not None, "contact_margin": RULES.contact_margin}
     values |= _describe_chart(chart, precision) | {"check": _compute_check(chart, controller, precision)}

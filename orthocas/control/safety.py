@@ -92,7 +92,7 @@ class Safety:
         int, "ticks without a good measurement for which the last command is held; beyond 1 ms each: milliseconds"
     ]
     stale_ticks: Annotated[
-        int, "ticks for which a moving arm may measure the same, bit by bit; more are a bad measurement"
+        int, "ticks, or milliseconds, in which a moving arm may measure the same, bit by bit; more are bad measurements"
     ]
     stuck_speed: Annotated[Array, "speed that an arm which measures the same may get [rad/s]; velocity laws: way [rad]"]
     longest_period: Annotated[float, "between two ticks; later ones call the catcher [s]"]

@@ -1,5 +1,6 @@
 """The supervised law keeps links from contacts where it has their capsules."""
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -58,3 +59,15 @@ def test_the_supervised_law_keeps_links_apart(planar_arm: oc.Chart, tmp_path: Pa
     assert gaps.min() > MARGIN - 1e-3
     assert statuses[-1] is ControlStatus.OK
     assert np.abs(path[-1] - start).max() < 0.02
+
+
+def test_the_stack_of_a_tick_counts_the_distance_of_links(planar_arm: oc.Chart, tmp_path: Path) -> None:
+    """By as many bytes as the header of the distance says."""
+    law = PDPlus.on_chart(planar_arm)
+    capsules = oc.fit_capsules(planar_arm.problem.robot.with_rods(0.02).collisions)
+    without = oc.generate_c(planar_arm, tmp_path / "without", law, "arm").stack_bytes
+    generated = oc.generate_c(planar_arm, tmp_path / "with", law, "arm", capsules=capsules)
+    header = (generated.folder / "arm_distance.h").read_text()
+    said = re.search(r"at most (\d+) bytes of stack", header)
+    assert said is not None
+    assert generated.stack_bytes == without + int(said[1])

@@ -10,9 +10,9 @@ from baselines import Projector
 from programs import Run, needs_c
 
 import orthocas as oc
-from orthocas.codegen import library
 from orthocas.control import ControlStatus, Kinematic, PDPlus, Reference, Safety, matched_stiffness
 from orthocas.errors import CompileError, InvalidValueError, ShapeError
+from orthocas.native import libraries
 from orthocas.simulation import Outcome, Push, Trajectory, simulate
 from orthocas.simulation.figure import trajectory_figure
 from orthocas.tools.checks import Array
@@ -171,7 +171,7 @@ def test_arguments_that_do_not_fit_are_named(law: PDPlus, chart: oc.Chart, monke
     posture = Reference.steps(projector.labels, projector.measured(q).full().ravel(), [], 0.2)
     with pytest.raises(InvalidValueError, match="without a chart"):
         simulate(projector, posture, q, control_rate=RATE, safety=Safety.of(projector))
-    monkeypatch.setattr(library.shutil, "which", lambda name: None)
+    monkeypatch.setattr(libraries.shutil, "which", lambda name: None)
     with pytest.raises(CompileError, match="no C compiler"):
         simulate(law, reference, q, control_rate=RATE, safety=safety)
 

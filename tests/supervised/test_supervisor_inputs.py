@@ -376,3 +376,17 @@ def test_joints_that_turn_without_end_may_report_any_number_of_whole_turns(
         commands.append(np.array([command for command, _ in ticks]))
     np.testing.assert_allclose(commands[1], commands[0], atol=1e-9)
     assert np.abs(commands[0] - supervised_law.problem.robot.gravity(q)).max() > 1.0
+
+
+def test_slow_programs_see_no_more_acceleration_than_there_is(
+    supervised_library: CompiledLibrary, supervised_law: Controller, planar_for_control: oc.Chart
+) -> None:
+    """At 50 Hz, 1.5 rad/s^2 up to two thirds of the limit, with motors that take their time."""
+    chart, q = planar_for_control, planar_for_control.problem.domain.centre - np.array([0.0, 0.0, 0.15])
+    settings = Safety.of(supervised_law, speed_limit=1.2, command_rate=100.0)
+    supervisor, way, period = Supervisor(supervised_library, supervised_law, settings), np.array([0.0, 0.0, 1.0]), 0.02
+    supervisor.take_over(q, chart.problem.robot.gravity(q))
+    for time in period * np.arange(27):
+        place = q + 0.75 * time**2 * way
+        supervisor.step(place, 1.5 * time * way, at_rest(chart, place + 0.05 * way), period)
+        assert supervisor.mode == 0

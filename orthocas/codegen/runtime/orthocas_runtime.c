@@ -49,7 +49,8 @@ static const struct {
 #ifndef ORTHOCAS_CHART_ONLY
   .turn = 6.283185307179586, .longest = 1e6, .implausible = 30.0, .jitter = 0.01, .alike = 0.2, .stirring = 1e-3,
   .standing = 0.1, .room = 0.05, .nearly = 0.2, .slow = 1.0 / 3.0, .settling = 0.5, .giving = 0.02, .learning = 2.0,
-  .lifted = 0.5, .far_off = 0.1, .deep = 0.5, .hasty = 5e-3, .contact = 0.2, .trend = 200.0, .stopping = 0.1, .forever = 1000000, .bisections = 10, .sweeps = 6,
+  .lifted = 0.5, .far_off = 0.1, .deep = 0.5, .hasty = 5e-3, .stopping = 0.1, .trend = 200.0,
+  .contact = 0.2, .forever = 1000000, .bisections = 10, .sweeps = 6,
 #endif
 };
 
@@ -715,11 +716,16 @@ static int moved_as_told(const orthocas_arm *arm, const orthocas_state *state, c
   return 1;
 }
 
+/* A count of ticks after one more, which counts its milliseconds if there are several: slower programs wait no longer. */
+static int later(int ticks, double period) {
+  return ticks < rules.forever ? ticks + (int)fmax(1.0, fmin(1e3 * period + 0.5, 1e3)) : ticks;
+}
+
 /* R7: a measurement can be true if it is finite, not absurdly fast, and near the last good one, unless that is long ago. */
 static int plausible(const orthocas_arm *arm, const orthocas_state *state, const double *q, const double *dq,
                      double period) {
   const orthocas_safety *safety = state->safety;
-  const double since = period * (1.0 + (double)state->bad_ticks);
+  const double since = period * (1.0 + (double)state->bad_ticks / (double)later(0, period));
   int i, odd = faster_than(arm, dq, safety->speed_limit, rules.implausible);
   for (i = 0; i < arm->n; ++i)
     if (state->bad_ticks < safety->hold_ticks &&
@@ -742,11 +748,6 @@ static int frozen(const orthocas_arm *arm, const orthocas_state *state, const do
     if (!solve(arm, M, speed, arm->n, 1)) set_zero(speed, arm->n);
   }
   return faster_than(arm, dq, safety->rest_speed, rules.stirring) || faster_than(arm, speed, safety->stuck_speed, 1.0);
-}
-
-/* A count of ticks after one more, which counts its milliseconds if there are several: slower programs wait no longer. */
-static int later(int ticks, double period) {
-  return ticks < rules.forever ? ticks + (int)fmax(1.0, fmin(1e3 * period + 0.5, 1e3)) : ticks;
 }
 
 /* Look at a measurement. Returns whether it can be used. */
@@ -826,14 +827,15 @@ static int works(int law) { return law == ORTHOCAS_OK || law == ORTHOCAS_SATURAT
  * the torque that drives them is taken back, which takes time by command_rate. */
 static int hurries(const orthocas_arm *arm, orthocas_state *state, const double *dq, double period) {
   const orthocas_safety *safety = state->safety;
+  const double rate = fmin(rules.trend, 1.0 / period);
   double until = 0.0;
   int i, hurry = faster_than(arm, dq, safety->speed_limit, 1.0);
   for (i = 0; i < arm->n && arm->torque; ++i)
     until = fmax(until, fabs(state->drive[i] - state->load[i]) / fmax(safety->command_rate[i], arm->numbers.smallest));
   for (i = 0; i < arm->n && arm->torque; ++i) {
-    const double gained = dq[i] - state->trend[i], soon = 0.5 * rules.trend * gained * until; /* as they gain */
+    const double gained = dq[i] - state->trend[i], soon = 0.5 * rate * gained * until; /* as they gain */
     hurry = hurry || (state->mode == ORTHOCAS_LAW && gained * dq[i] > 0.0 && fabs(dq[i] + soon) > safety->speed_limit[i]);
-    state->trend[i] += fmin(1.0, rules.trend * period) * gained;
+    state->trend[i] += rate * period * gained;
   }
   return hurry;
 }
@@ -843,13 +845,13 @@ static int hurries(const orthocas_arm *arm, orthocas_state *state, const double 
 static int stops_clear(const orthocas_arm *arm, const orthocas_safety *safety, const double *q, const double *dq,
                        double *work) {
   const double time = safety->fade_out + 1.0 / safety->damping;
-  double *ahead = take(&work, arm->n), nearest = contact_room(arm, q, work);
-  int i, k;
-  for (k = 1; k <= 2; ++k) {
-    for (i = 0; i < arm->n; ++i) ahead[i] = q[i] + 0.5 * k * time * dq[i];
-    nearest = fmin(nearest, contact_room(arm, ahead, work));
+  double *ahead = take(&work, arm->n);
+  int i, k, clear = 1;
+  for (k = 1; k <= 2 && clear; ++k) {
+    for (i = 0; i < arm->n; ++i) ahead[i] = q[i] + 0.5 * (double)k * time * dq[i];
+    clear = contact_room(arm, ahead, work) > 0.0;
   }
-  return nearest > 0.0;
+  return clear;
 }
 
 /* R12: who commands, by the table of modes. law: its status. Joints may be fast for 5 ms, which they get back in 10 ms. */
@@ -1305,6 +1307,7 @@ ORTHOCAS_API void orthocas_stand(const orthocas_arm *arm, orthocas_state *state,
   if (arm->torque) {
     set_zero(state->expected, n);
     set_zero(state->unexplained, n);
+    set_zero(state->momentum, n);
     set_zero(state->load, n);
   }
   if (arm->memory > 0) copy(state->memory, arm->memory_start, arm->memory);
@@ -1330,7 +1333,7 @@ static void brake_unseen(const orthocas_arm *arm, orthocas_state *state, int fir
     for (i = 0; i < n; ++i) state->load[i] = state->impulse_from[i] - fallback[i];
   (void)orthocas_dynamics(arm, state->q, state->dq, M, bias, gravity);
   copy(held, M, n * n);
-  if (!solve(arm, held, state->momentum, n, 1)) set_zero(state->momentum, n);
+  if (!solve(arm, held, state->momentum, n, 1) || !all_finite(arm, state->momentum, n)) set_zero(state->momentum, n);
   for (i = 0; i < n; ++i) {
     state->dq[i] += state->momentum[i];
     state->q[i] += period * state->dq[i];
@@ -1410,6 +1413,7 @@ ORTHOCAS_API int orthocas_step(const orthocas_arm *arm, orthocas_state *state, i
   if (arm->torque) observe(arm, state, here, speed, since);
   known = !state->fresh && state->bad_ticks == 0 && !late && state->mode != ORTHOCAS_HOLD;
   state->bad_ticks = 0;
+  if (arm->torque && !known) copy(state->trend, speed, n); /* nobody saw how it got them */
   copy(state->q, here, n);
   copy(state->dq, speed, n);
   clear = clearance(arm, here, work);
