@@ -126,10 +126,10 @@ class ArrayObjective:
         other._put(samples)
         return other
 
-    def part(self, places: NDArray[np.int_]) -> Self:
-        """The same loss on some of its samples, which may repeat."""
+    def part(self, places: NDArray[np.int_] | slice) -> Self:
+        """The same loss on some of its samples, in this order."""
         other = copy(self)
-        other._divide(self._points[places], self._entries[places])
+        other._hold(self._points[places], self._entries[places])
         return other
 
     def _round(self, theta: Array) -> Array:
@@ -139,19 +139,23 @@ class ArrayObjective:
     def _put(self, samples: Samples) -> None:
         data = samples.collect_data(self._loss.data, self._orientation)
         self._ends = np.cumsum([array[0].size for array in data], dtype=int)
-        self._divide(samples.points, _entries(data, len(samples)))
+        self._hold(samples.points, _entries(data, len(samples)))
 
-    def _divide(self, points: Array, entries: Array) -> None:
-        """Use these samples, in pieces of nearly equal size."""
-        self._points, self._entries = points, entries
-        N, most = len(points), max(RULES.least_piece, RULES.piece // (self.r * self._family.width))
-        size = ceil(N / ceil(N / most))
-        self._pieces = []
-        for k in range(0, N, size):
-            # all data of a sample in one row, so that samples drawn at random are gathered at once
-            *blocks, _ = np.split(arrange_blocks(entries[k : k + size]), self._ends, axis=1)
-            own = points[k : k + size]
-            self._pieces.append(_Piece(own, blocks, build_weights(len(own)) * (len(own) / N)))
+    def _hold(self, points: Array, entries: Array) -> None:
+        """Use these samples, with all data of each in one row, so that samples drawn at random are gathered at once."""
+        self._points, self._entries, self._arranged = points, entries, list[_Piece]()
+
+    @property
+    def _pieces(self) -> list[_Piece]:
+        """The samples in pieces of nearly equal size, arranged once they are evaluated."""
+        if not self._arranged:
+            N, most = len(self._points), max(RULES.least_piece, RULES.piece // (self.r * self._family.width))
+            size = ceil(N / ceil(N / most))
+            for k in range(0, N, size):
+                *blocks, _ = np.split(arrange_blocks(self._entries[k : k + size]), self._ends, axis=1)
+                own = self._points[k : k + size]
+                self._arranged.append(_Piece(own, blocks, build_weights(len(own)) * (len(own) / N)))
+        return self._arranged
 
 
 class GraphObjective:
@@ -210,10 +214,11 @@ class GraphObjective:
         other._put(samples, len(samples))
         return other
 
-    def part(self, places: NDArray[np.int_]) -> Self:
-        """The same loss on some of its samples, which may repeat."""
+    def part(self, places: NDArray[np.int_] | slice) -> Self:
+        """The same loss on some of its samples, in this order."""
         other = copy(self)
-        other._divide(self._points[places], self._entries[places], len(places))
+        points = self._points[places]
+        other._divide(points, self._entries[places], len(points))
         return other
 
     def _put(self, samples: Samples, room: int) -> None:

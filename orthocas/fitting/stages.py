@@ -286,9 +286,13 @@ class Resampled:
 
     def batches(self, size: int, count: int, seed: tuple[int, ...]) -> Iterator[Objective]:
         """The mean over `size` samples drawn from all, `count` times."""
-        rng = np.random.default_rng(seed)
-        for _ in range(count):
-            yield self._whole.part(rng.integers(self._count, size=size))
+        rng, size = np.random.default_rng(seed), min(size, self._count)
+        while count > 0:
+            # all samples are gathered once in a random order: parts of them need no copies
+            shuffled = self._whole.part(rng.permutation(self._count)[: count * size])
+            for start in range(0, min(count * size, self._count - size + 1), size):
+                yield shuffled.part(slice(start, start + size))
+                count -= 1
 
 
 @dataclass(frozen=True, eq=False)

@@ -195,6 +195,27 @@ class MetricTaskTerm:
 
 
 @dataclass(frozen=True)
+class SelfMotionTerm:
+    """sin^2 of the leak of a single coordinate, 1 - (v . z)^2 / |v|_A^-1^2, with the A-unit self-motion z.
+
+    It is `MetricTaskTerm` times m, for r = 1, with one residual and without a basis of the task gradients: half of the
+    work of descents that need no Gauss-Newton matrix.
+    """
+
+    name: str = "self-motion"
+    data: tuple[str, ...] = ("metric_inverse", "null_basis")
+    hinge: bool = False
+
+    def residuals(self, coordinate_jacobian: ca.SX, data: Data, sizes: Sizes) -> ca.SX:
+        """The sine, (1, 1)."""
+        cosine = (
+            coordinate_jacobian @ data["null_basis"] / metric_lengths(coordinate_jacobian, data.get("metric_inverse"))
+        )
+        rho: ca.SX = ca.sqrt(ca.fmax(1 - cosine**2, RULES.shortest))
+        return rho
+
+
+@dataclass(frozen=True)
 class MetricMutualTerm:
     """Mean over pairs of coordinates of the squared cosines in the metric. It is empty for r = 1.
 
@@ -389,6 +410,7 @@ _OF_WIDE_FITS = (
     RegularityTerm("volume with the worst", RULES.worst_volume),
     RegularityTerm("euclidean volume", RULES.beyond * RULES.least_in_metric, euclidean=True),
     MetricLengthTerm(),
+    SelfMotionTerm(),
 )
 _OURS = (MetricTaskTerm(), MetricMutualTerm(), LengthTerm(), RegularityTerm(), FOLD_TERM)
 for _term in (TaskTerm(), MutualTerm(), *_OURS, *_OF_WIDE_FITS):

@@ -98,9 +98,9 @@ def fit_wide(
     1. Under a whole pose or orientation, families without the last joint, and linear in the first one, come first. If
        the first one can turn fully, families without both come before these. Then xi stays while base or tool turn
        about their own axes: full turns close, and rolling the hand moves no other joint. The families are polynomials.
-       In another metric than the identity and with r = 1, MLP((24, 24, 24), raw=True) is tried before each polynomial:
-       its leaks are smaller, but it has no proof in a useful time. A family is kept if it leaves out little of the
-       branch after all rounds of 4.
+       In another metric than the identity and with r = 1, MLP((24, 24, 24), raw=True) has the choice before each
+       polynomial: its leaks are smaller, but it has no proof in a useful time. A family is kept if it leaves out little
+       of the branch after all rounds of 4. Where the polynomial leaves out more than a tenth at first, 3 follows.
     2. Polynomials that are linear in each joint on whose position self-motions do not depend, such as the first and the
        last one, descend with L-BFGS from linear coordinates across the task at the centre of the branch. They are best
        to prove, and hold at any turn of these joints. They ask that self-motions turn base and tool in one direction.

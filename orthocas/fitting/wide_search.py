@@ -2,6 +2,7 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
+from itertools import groupby
 
 import numpy as np
 import scipy
@@ -80,6 +81,7 @@ class WideRules:
     poor_of_several: float = 4e-3  #: the same with r > 1
     poor_without_turns: float = 3e-3  #: the same of coordinates without the turns of tool and base, after all rounds
     poor_without_tool: float = 6e-3  #: the same of coordinates without the turn of the tool only
+    hopeless: float = 0.1  #: fraction above which no family without the turn of the tool can be regular enough
     very_poor: float = 2e-2  #: fraction above which it is a network at once
     still_poor: float = 6e-3  #: fraction above which it is a network after polynomials in all joints
 
@@ -133,16 +135,25 @@ def search_families(searches: Sequence["Search"]) -> "Search":
     taken, or the best of those that follow if it is poor.
     """
     symmetric = [search for search in searches if search.left_out]
-    for search in symmetric:
-        search.begin(f"{_STAGE}, {search.parametrisation.label}")
-        most = RULES.poor_without_turns if len(search.left_out) > 1 else RULES.poor_without_tool
-        # rounds with the worst samples divide the fraction of bad positions by two to four
-        if search.is_enough(4 * most):
-            search.go_on()
-        if search.is_enough(most) or len(searches) == 1:
-            return search
+    hopeless = False
+    for _, group in groupby(symmetric, key=lambda search: search.left_out):
+        # the polynomial begins: in a third of a network's time, it shows where neither has a chance
+        *networks, last = group
+        last.begin(f"{_STAGE}, {last.parametrisation.label}")
+        hopeless = last.rank[1] > RULES.hopeless
+        for search in (*([] if hopeless else networks), last):
+            if search is not last:
+                search.begin(f"{_STAGE}, {search.parametrisation.label}")
+            most = RULES.poor_without_turns if len(search.left_out) > 1 else RULES.poor_without_tool
+            # rounds with the worst samples divide the fraction of bad positions by two to four
+            if search.is_enough(4 * most):
+                search.go_on()
+            if search.is_enough(most) or len(searches) == 1:
+                return search
     first, *others = searches[len(symmetric) :]
-    first.begin(_STAGE)
+    # what is linear in base and tool is as bad then
+    if not hopeless or all(search.linear for search in others):
+        first.begin(_STAGE)
     missed, bad, _ = first.rank
     if missed or bad > (RULES.poor if first.problem.r == 1 else RULES.poor_of_several):
         networks = [search for search in others if not search.linear]
@@ -189,7 +200,7 @@ class Search:
         wide = int(np.clip(RULES.per_term * self.family.width, RULES.least_samples, RULES.most_samples))
         of_networks = RULES.small_network_samples if self.left_out else RULES.network_samples
         self.samples = settings.samples or (wide if self.linear else of_networks)
-        self.solver: Solver = LBFGS(RULES.iterations, RULES.tolerance) if self.linear else _ADAM
+        self.solver: Solver = LBFGS(RULES.iterations, RULES.tolerance) if self.linear else self._of_batch(_ADAM)
         self.best: Array | None = None  #: parameters, (size,)
         #: of the best: whether they miss the centre, fraction of bad positions, if too many, and minus their 1 % volume
         self.rank = (True, np.inf, np.inf)
@@ -236,7 +247,7 @@ class Search:
                 solver: Solver = LBFGS(RULES.further, RULES.tolerance)
             elif self.left_out:
                 self._add_worst(RULES.fresh_of_small_networks, RULES.worst_of_small_networks, RULES.fresh_tag + turn)
-                solver = _SLOWER_OF_SMALL
+                solver = self._of_batch(_SLOWER_OF_SMALL)
             else:
                 self._add_worst(RULES.fresh_of_networks, RULES.worst_of_networks, RULES.fresh_tag + turn)
                 solver = _SLOWER
@@ -247,10 +258,14 @@ class Search:
         if finished and self._last is self.best and not balanced:
             self._alignment *= RULES.closer if self.problem.r == 1 else RULES.closer_of_several
             first = self.linear and len(self._samples) == 1
-            solver = LBFGS(RULES.further, RULES.tolerance) if self.linear else _SLOWER_OF_SMALL
+            solver = LBFGS(RULES.further, RULES.tolerance) if self.linear else self._of_batch(_SLOWER_OF_SMALL)
             rank = self._descend("smaller leaks", "volume" if first else "volume with the worst", solver)
             if self._done or (not self.linear and not rank[0] and rank[1] <= RULES.enough):
                 self.best, self.rank = self._last, rank
+
+    def _of_batch(self, solver: Adam) -> Adam:
+        """The solver with the samples of a step: half of them serve small networks, but not those of all joints."""
+        return replace(solver, batch=solver.batch // 2) if self.left_out else solver
 
     def is_enough(self, bad: float) -> bool:
         """Whether the best coordinates are regular at the centre, and at most at a fraction of samples not."""
@@ -332,8 +347,9 @@ class Search:
         """Let those of fresh samples join at which the last coordinates have the least volumes."""
         points = self.sample(fresh, tag)
         # matrices of all would take a gigabyte
-        parts = [sample_frames(self.problem, part) for part in np.array_split(points, -(-fresh // RULES.held_out))]
-        volumes = np.concatenate([self._sign * self._evaluate_volumes(self._last, part) for part in parts])
+        parts = np.array_split(points, -(-fresh // RULES.held_out))
+        frames = (sample_plain_frames(self.problem, part) for part in parts)
+        volumes = np.concatenate([self._sign * self._evaluate_volumes(self._last, part) for part in frames])
         self._samples.append(sample_frames(self.problem, points[np.argsort(volumes)[:worst]]))
 
     def _descend(self, name: str, volume: str, solver: Solver) -> tuple[bool, float, float]:
@@ -372,7 +388,11 @@ class Search:
             mutual = RULES.mutual if self.settings.quantities is None else 0.0
             angles = 2 * self.problem.m * self._alignment, 2 * mutual
             users = Weights(*angles, 0.0, 0.0, 0.0, dict(users or {}), "metric")
-        return replace(users, folds=0.0, extra={**own, **users.extra}).for_problem(self.problem)
+        users = replace(users, folds=0.0, extra={**own, **users.extra}).for_problem(self.problem)
+        if self.problem.r > 1 or users.angles == "paper":
+            return users
+        # the same leak by the self-motion, which is a single one
+        return replace(users, task=0.0, extra={**users.extra, "self-motion": users.task / self.problem.m})
 
     def _build_in_basis(self, volume: str) -> "Orthonormal":
         """The loss of a family that is linear in its parameters, on all samples so far, with terms of what xi means.
@@ -434,7 +454,7 @@ class Search:
         return rank
 
     def _evaluate_volumes(self, theta: Array, samples: Samples) -> Array:
-        """The volumes of `RegularPart` in the identity metric, (N,)."""
+        """The volumes of `RegularPart` in the identity metric, (N,), at plain frames."""
         if self.linear:
             C = theta.reshape(self.problem.r, -1)
             J = self._basis.jacobian(self._basis.at(samples.points), C, len(samples))
@@ -442,11 +462,7 @@ class Search:
             J = self.coordinates(theta).jacobian(samples.points)
         # det of orthonormal task rows and unit gradients, by a basis across the task
         unit = J / np.maximum(np.linalg.norm(J, axis=2, keepdims=True), LOSS.shortest)
-        Z = samples.null_basis
-        volumes = np.linalg.det(unit @ Z)
-        if samples.metric_inverse is not None:
-            volumes /= np.sqrt(np.linalg.det(Z.transpose(0, 2, 1) @ Z))
-        return np.asarray(volumes)
+        return np.asarray(np.linalg.det(unit @ samples.null_basis))
 
     @cached_property
     # built when this family is tried, and not before
@@ -457,12 +473,12 @@ class Search:
     @cached_property
     def _centre(self) -> Samples:
         """The centre of the domain."""
-        return sample_frames(self.problem, self.problem.domain.home[None])
+        return sample_plain_frames(self.problem, self.problem.domain.home[None])
 
     @cached_property
     def _held_out(self) -> Samples:
         """Samples that evaluate coordinates."""
-        return sample_frames(self.problem, self.sample(RULES.held_out, RULES.held_out_tag))
+        return sample_plain_frames(self.problem, self.sample(RULES.held_out, RULES.held_out_tag))
 
 
 def is_on_side_of_centre(problem: Problem, points: Array) -> NDArray[np.bool_]:
@@ -478,9 +494,16 @@ def is_on_side_of_centre(problem: Problem, points: Array) -> NDArray[np.bool_]:
 
 def sample_frames(problem: Problem, points: Array) -> Samples:
     """Samples with the frame Jacobian, which half a turn of the tool does not spoil."""
+    frames = sample_plain_frames(problem, points)
+    if problem.metric.is_identity:
+        return frames
+    return Samples(points, frames.task_jacobian, np.asarray(np.linalg.inv(problem.metric.evaluate(points))))
+
+
+def sample_plain_frames(problem: Problem, points: Array) -> Samples:
+    """The same in the identity metric, in which regularity is judged."""
     J = problem.task.batched_frame_jacobian(points)[0].reshape(len(points), problem.task.m, problem.n)
-    inverse = None if problem.metric.is_identity else np.linalg.inv(problem.metric.evaluate(points))
-    return Samples(points, J, None if inverse is None else np.asarray(inverse))
+    return Samples(points, J, None)
 
 
 def join_samples(parts: Sequence[Samples]) -> Samples:

@@ -27,7 +27,8 @@ def arrange_blocks(stack: Array) -> Array:
     """Arrange samples (N, rows, columns) or (N, rows) in blocks (B, entries, c)."""
     flat = (stack.transpose(0, 2, 1) if stack.ndim == 3 else stack).reshape(len(stack), -1)
     blocks = -(-len(flat) // COLUMNS)
-    filled = np.concatenate([flat, np.repeat(flat[:1], blocks * COLUMNS - len(flat), axis=0)])
+    missing = blocks * COLUMNS - len(flat)
+    filled = np.concatenate([flat, np.repeat(flat[:1], missing, axis=0)]) if missing else flat
     return np.ascontiguousarray(filled.reshape(blocks, COLUMNS, -1).transpose(0, 2, 1))
 
 

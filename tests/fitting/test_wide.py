@@ -41,7 +41,9 @@ from orthocas.fitting import wide as wide_fits
 from orthocas.fitting.basis_objective import BasisObjective, build_gradients
 from orthocas.fitting.like import Like, QuadraticTerm
 from orthocas.fitting.network_objective import ArrayObjective
+from orthocas.fitting.sample_loss import Loss, build_sample_loss
 from orthocas.fitting.stages import Resampled
+from orthocas.fitting.terms import Sizes
 from orthocas.fitting.wide import WideFit, _build_problems, _describe_left_out, _fit_most
 from orthocas.fitting.wide_search import Search, WideSettings, sample_frames, search_families
 from orthocas.solvers.protocol import Status
@@ -1133,3 +1135,17 @@ def test_cuts_of_two_arms_are_those_of_each() -> None:
         assert found[cut.joint_name, cut.singular] == pytest.approx(cut.value, abs=0.05)
     of_right = oc.branches(both, oc.Task.pose(both, frame=tips[1]))
     assert {cut.joint_name.partition("_")[0] for cut in of_right.cuts} == {"right"}
+
+
+def test_the_leak_by_the_self_motion_is_that_by_task_gradients() -> None:
+    known = oc.problems.get("planar_3r_xy")
+    problem = oc.Problem(known.robot, known.task, "inertia", BENT)
+    samples = sample_frames(problem, sample_uniform(problem.domain, 50, 0))
+    J = np.random.default_rng(1).normal(size=(len(samples), 1, 3))
+    squares = np.einsum("srn,srn->s", J, samples.compute_metric_gradients(J))
+    sines = ((samples.task_basis @ J.transpose(0, 2, 1))[:, :, 0] ** 2).sum(axis=1) / squares
+    loss = build_sample_loss(Loss.of(Sizes(3, 2, 1, False), {"self-motion": 2.0}))
+    found = [
+        float(loss(j, inverse, z)) for j, inverse, z in zip(J, samples.metric_inverse, samples.null_basis, strict=True)
+    ]
+    np.testing.assert_allclose(found, sines, atol=1e-10)
