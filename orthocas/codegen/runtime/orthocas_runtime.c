@@ -866,9 +866,8 @@ static void choose_mode(const orthocas_arm *arm, orthocas_state *state, int law,
   state->hasty = hurry ? fmin(state->hasty + period, rules.hasty) : fmax(0.0, state->hasty - 0.5 * period);
   if (state->mode == ORTHOCAS_LAW) {
     if (!works(law)) catch_arm(arm, state, law, q);
-    else if (distance(arm, q, speed, safety->fade_out, clear, work) < safety->catch_margin)
-      catch_arm(arm, state, ORTHOCAS_OUTSIDE_DOMAIN, q);
-    else if (arm->kernels.gap_of_links != 0 && !stops_clear(arm, safety, q, dq, work))
+    else if (distance(arm, q, speed, safety->fade_out, clear, work) < safety->catch_margin ||
+             (arm->kernels.gap_of_links != 0 && !stops_clear(arm, safety, q, dq, work)))
       catch_arm(arm, state, ORTHOCAS_OUTSIDE_DOMAIN, q);
     else if (fast) catch_arm(arm, state, ORTHOCAS_TOO_FAST, q);
     else if (late) catch_arm(arm, state, ORTHOCAS_LATE, q);
