@@ -12,7 +12,7 @@ import numpy as np
 from orthocas.charts.coordinates import Coordinates
 from orthocas.errors import CompileError, InvalidValueError
 from orthocas.native import curves
-from orthocas.native.kernels import generate_kernels
+from orthocas.native.kernels import Kernels, generate_kernels
 from orthocas.native.libraries import keep_library, load_library, pointer
 from orthocas.native.rendering import get_source, render
 from orthocas.tools.batch import dense_function
@@ -104,15 +104,8 @@ def find_kernel(chart: Chart) -> MotionKernel | None:
 
 def write_motion(chart: Chart) -> dict[str, str]:
     """Sources of `MotionKernel`, by the names of their files."""
-    q, x, own, domain = ca.MX.sym("q", chart.n), ca.MX.sym("x", chart.m), chart.coordinates.functions, chart.domain
-    functions = [
-        dense_function("task", [q, x], chart.parts.tracer.equations.call([q, x])),
-        dense_function("xi", [q], [chart.parts.runnable(own["xi"])(q)]),
-        dense_function("gradient", [q], [chart.parts.runnable(own["jacobian"])(q)]),
-    ]
-    if domain.condition is not None:
-        functions.append(dense_function("pivots", [q], [domain.condition.pivots(q)]))
-    kernels, (low, high) = generate_kernels(functions, "kernel"), domain.bounds
+    domain, kernels = chart.domain, generate_curve_kernels(chart)
+    low, high = domain.bounds
     values = {
         "kernels": kernels.code,
         "arrays": kernels.declare_arrays,
@@ -129,3 +122,16 @@ def write_motion(chart: Chart) -> dict[str, str]:
     }
     included = {name: get_source(name) for name in ("self_motion.c", "curve_math.c")}
     return {"chart_motion.c": render("chart_motion.c", values, __package__), **included}
+
+
+def generate_curve_kernels(chart: Chart) -> Kernels:
+    """Errors and gradients of the task, xi with its gradient, and the condition of the domain, if it has one."""
+    q, x, own, domain = ca.MX.sym("q", chart.n), ca.MX.sym("x", chart.m), chart.coordinates.functions, chart.domain
+    functions = [
+        dense_function("task", [q, x], chart.parts.tracer.equations.call([q, x])),
+        dense_function("xi", [q], [chart.parts.runnable(own["xi"])(q)]),
+        dense_function("gradient", [q], [chart.parts.runnable(own["jacobian"])(q)]),
+    ]
+    if domain.condition is not None:
+        functions.append(dense_function("pivots", [q], [domain.condition.pivots(q)]))
+    return generate_kernels(functions, "kernel")

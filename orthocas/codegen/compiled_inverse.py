@@ -9,7 +9,6 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
@@ -17,13 +16,13 @@ from orthocas.charts.chart import Chart
 from orthocas.charts.curve_tracer import RULES
 from orthocas.charts.curves import Nearest, SelfMotionCurves
 from orthocas.charts.inverse import Inverse, Solutions, build_phi, build_phi_of_wish, solve_rows
+from orthocas.charts.motion_kernel import generate_curve_kernels
 from orthocas.charts.newton import NEWTON, Attempt, Newton
 from orthocas.codegen.generate import generate_c
 from orthocas.codegen.rendering import get_source, render
 from orthocas.native import rendering
-from orthocas.native.kernels import generate_kernels
 from orthocas.native.libraries import keep_library, load_library, pointer
-from orthocas.tools.batch import dense_function, run_in_threads
+from orthocas.tools.batch import run_in_threads
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, require_kind
 from orthocas.tools.display import Shown
@@ -85,17 +84,8 @@ def write_curve_source(chart: Chart, curves: SelfMotionCurves) -> str:
     Raises:
         DomainError: if the domain has a condition, but no expression of it.
     """
-    q, domain = ca.MX.sym("q", chart.n), chart.problem.domain
-    x, own = ca.MX.sym("x", chart.m), chart.coordinates.functions
-    # Errors and gradients of the task, xi with its gradient, and the condition of the domain.
-    functions = [
-        dense_function("curve_task", [q, x], curves.tracer.equations.call([q, x])),
-        dense_function("curve_xi", [q], [chart.parts.runnable(own["xi"])(q)]),
-        dense_function("curve_gradient", [q], [chart.parts.runnable(own["jacobian"])(q)]),
-    ]
-    if domain.condition is not None:
-        functions.append(dense_function("curve_pivots", [q], [domain.condition.pivots(q)]))
-    kernels, (low, high) = generate_kernels(functions, "kernel"), domain.bounds
+    domain, kernels = chart.problem.domain, generate_curve_kernels(chart)
+    low, high = domain.bounds
     values = {
         "kernels": kernels.code,
         "arrays": kernels.declare_arrays,
@@ -112,7 +102,7 @@ def write_curve_source(chart: Chart, curves: SelfMotionCurves) -> str:
         "turning": curves.tracer.turning,
         "bounded": np.isfinite(low),
         "winding": curves.boxed.winding,
-        "pivots": kernels.numbers.get("curve_pivots", 0),
+        "pivots": kernels.numbers.get("pivots", 0),
     }
     return render("curves.c", values)
 
