@@ -26,6 +26,7 @@ static const struct {
   double jitter;      /* of positions between two ticks, by encoders and their noise [rad] or [m] */
   double alike;       /* share by which a motion may differ from that of the measured speeds */
   double stirring;    /* of the rest speed: slower joints may stand, as simulated ones do with a dq of 1e-18 */
+  double slowest;     /* of the rest speed: an arm so slow is held by its command */
   double standing;    /* share of its velocity by which a reference that stands still may move */
   double room;        /* how far inside the return margin the arm is brought, so that it is clearly inside [half-widths] */
   double nearly;      /* of the rest speed: the law takes over at the end of the way back, with a reference at rest */
@@ -47,7 +48,7 @@ static const struct {
 } rules = {
   .halvings = 20,
 #ifndef ORTHOCAS_CHART_ONLY
-  .turn = 6.283185307179586, .longest = 1e6, .implausible = 30.0, .jitter = 0.01, .alike = 0.2, .stirring = 1e-3,
+  .turn = 6.283185307179586, .longest = 1e6, .implausible = 30.0, .jitter = 0.01, .alike = 0.2, .stirring = 1e-3, .slowest = 0.04,
   .standing = 0.1, .room = 0.05, .nearly = 0.2, .slow = 1.0 / 3.0, .settling = 0.5, .giving = 0.02, .learning = 2.0,
   .lifted = 0.5, .far_off = 0.1, .deep = 0.5, .hasty = 5e-3, .stopping = 0.1, .trend = 200.0,
   .contact = 0.2, .forever = 1000000, .bisections = 10, .sweeps = 6,
@@ -1327,14 +1328,16 @@ static void brake_unseen(const orthocas_arm *arm, orthocas_state *state, int fir
                          double *command, double *work) {
   const int n = arm->n;
   double *M = take(&work, n * n), *bias = take(&work, n), *gravity = take(&work, n), *held = take(&work, n * n);
+  /* An observer foresaw what the arm got meanwhile, unless measurements that stood still held it back. */
+  const int foreseen = first && state->same_ticks - state->bad_ticks <= state->safety->stale_ticks;
   int i, j;
-  if (first && !faster_than(arm, state->dq, state->safety->rest_speed, rules.stirring))
+  if (first && !faster_than(arm, state->dq, state->safety->rest_speed, rules.slowest))
     for (i = 0; i < n; ++i) state->load[i] = state->impulse_from[i] - fallback[i];
   (void)orthocas_dynamics(arm, state->q, state->dq, M, bias, gravity);
   copy(held, M, n * n);
   if (!solve(arm, held, state->momentum, n, 1) || !all_finite(arm, state->momentum, n)) set_zero(state->momentum, n);
   for (i = 0; i < n; ++i) {
-    state->dq[i] += state->momentum[i];
+    if (!(foreseen && state->safety->observer_rate[i] > 0.0)) state->dq[i] += state->momentum[i];
     state->q[i] += period * state->dq[i];
   }
   (void)orthocas_dynamics(arm, state->q, state->dq, M, bias, gravity);
