@@ -49,7 +49,7 @@ def test_self_motion_of_a_planar_arm_is_the_closed_form() -> None:
 def test_c_and_python_end_at_the_same_places(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without a C compiler, Python follows the curves: ranges agree to 1e-9, and so do ends of self-motions."""
     chart = circle() if name == "circle" else oc.load(name)
-    q = chart.domain.sample(20, 5)
+    q = chart.domain.sample(6 if name == "circle" else 20, 5)
     in_c = [(chart.xi_range(point), chart.self_motion(point)) for point in q]
     monkeypatch.setattr(type(chart.parts), "motion_kernel", None)
     for point, (reach, motion) in zip(q, in_c, strict=True):
@@ -86,9 +86,9 @@ def test_without_a_library_python_follows_the_curves(
 
 
 def test_ranges_of_a_grown_chart_end_where_it_ends() -> None:
-    """Of 12 postures one is outside the chart; the curves of the others leave it, or the domain."""
+    """The curves of some postures leave the chart, those of others the domain."""
     chart, ends = disk(), set()
-    for q in chart.domain.sample(12, 0):
+    for q in chart.domain.sample(12, 0)[::3]:
         if np.isfinite(chart.xi(q)).all():
             ranges = chart.xi_range(q)
             assert (ranges.low <= chart.xi(q)).all()

@@ -71,8 +71,8 @@ def wrapped(angles: Numbers) -> Numbers:
 @pytest.mark.parametrize(
     ("name", "kind"),
     [
-        *zip(ARMS, SEW_KINDS * 2, strict=True),
-        *nightly(*zip(ARMS, SEW_KINDS[::-1] * 2, strict=True)),
+        *tuple(zip(ARMS, SEW_KINDS * 2, strict=True))[1:3],
+        *nightly(*zip(ARMS, SEW_KINDS[::-1] * 2, strict=True), *tuple(zip(ARMS, SEW_KINDS * 2, strict=True))[::3]),
     ],
 )
 def test_xi_is_the_swivel_and_moves_it_by_what_is_asked(name: str, kind: SEWKind) -> None:
