@@ -103,8 +103,8 @@ def _find_mimics(mujoco: Any, compiled: Any, locked: Mapping[str, float]) -> dic
         coupling = Mimic(names[1], float(a1), ref1 + float(a0) - float(a1) * ref2)
         if direct.setdefault(names[0], coupling) != coupling:
             raise RobotError(
-                f"joint '{names[0]}' is coupled to '{direct[names[0]].leader}' and, otherwise, to '{names[1]}', expected "
-                f"one linear coupling of a joint: {suggest_lock(names[0])}"
+                f"joint '{names[0]}' is coupled to '{direct[names[0]].leader}' and, otherwise, to '{names[1]}', "
+                f"expected one linear coupling of a joint: {suggest_lock(names[0])}"
             )
     return resolve_mimics(direct)
 
