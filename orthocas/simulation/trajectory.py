@@ -60,16 +60,14 @@ _OF_JOINTS = ("q", "dq", "command")  #: one number for every joint; the others f
 _REQUIRED = tuple(name for name in _ARRAYS if name not in _LATER)
 
 
-def read_run_file(
-    path: Path, version: int, names: Sequence[str], later: Sequence[str] = ()
-) -> tuple[dict[str, Any], dict[str, Stored]]:
-    """Header and the named arrays of a run, and the later ones if the file has them; other entries are left alone.
+def read_run_file(path: Path) -> tuple[dict[str, Any], dict[str, Stored]]:
+    """Header and arrays of a run, later ones if the file has them; other entries are left alone.
 
     Raises:
         TrajectoryFileError: if the file is missing, damaged, foreign or from a newer version.
     """
     with open_archive(path, "trajectory", TrajectoryFileError) as zipped:
-        entries = ["header", *names, *(name for name in later if f"{name}.npy" in zipped.sizes)]
+        entries = ["header", *_REQUIRED, *(name for name in _LATER if f"{name}.npy" in zipped.sizes)]
         zipped.require_room([f"{name}.npy" for name in entries])
         try:
             stored = {name: read_npy(zipped.read(f"{name}.npy")) for name in entries}
@@ -78,9 +76,9 @@ def read_run_file(
             if isinstance(error, TrajectoryFileError):
                 raise
             raise TrajectoryFileError(f"{path} contains an array or a header that cannot be read: {error}") from None
-    if not isinstance(header, dict) or header.get("version") != version:
+    if not isinstance(header, dict) or header.get("version") != _VERSION:
         saved = header.get("version") if isinstance(header, dict) else None
-        raise TrajectoryFileError(f"{path} has version {saved}, this orthocas reads {version}")
+        raise TrajectoryFileError(f"{path} has version {saved}, this orthocas reads {_VERSION}")
     return header, stored
 
 
@@ -224,7 +222,7 @@ class Trajectory(Shown):
             TrajectoryFileError: if the file is missing, damaged, foreign or from a newer version.
         """
         path = as_path("path", path)
-        header, arrays = read_run_file(path, _VERSION, _REQUIRED, _LATER)
+        header, arrays = read_run_file(path)
         try:
             # The header first: it says which shapes the arrays must have.
             names: dict[str, Any] = {name: tuple(get_part(header, name, list)) for name in ("labels", "joint_names")}
