@@ -314,7 +314,7 @@ def test_a_hand_that_rolls_moves_no_other_joint_and_closes_its_turns() -> None:
 
 @pytest.mark.slow
 def test_coordinates_without_the_roll_are_tried_first(tmp_path: Path) -> None:
-    fit = oc.fit_wide(iiwa(), oc.Task.pose(iiwa()), home_branch(), samples=4000)
+    fit = oc.fit_wide(iiwa(), oc.Task.pose(iiwa()), home_branch(), samples=2000)
     assert fit.chart.coordinates.label == "polynomial:6:cyclic=A1:without=A7"
     assert fit.regular_share > 0.999
     fit.chart.save(tmp_path / "wide.orthocas")
