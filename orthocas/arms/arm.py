@@ -100,7 +100,7 @@ class Postures(Shown):
         return self.status == InverseStatus.FOUND
 
     def facts(self) -> dict[str, str]:
-        """How many rows ended how."""
+        """Number of rows with each status."""
         values = np.atleast_1d(self.status)
         counts = {status.name: int((values == status).sum()) for status in InverseStatus}
         names = [self.branch] if isinstance(self.branch, str) else sorted(set(self.branch))

@@ -51,7 +51,7 @@ class Curve:
 def evaluate_cubic(
     a: Array, b: Array, start: Array, end: Array, h: Array | float, u: Array | float
 ) -> tuple[Array, Array]:
-    """Points at shares u of cubic curves of length h from a to b with unit tangents, and unit directions there."""
+    """Points at fractions u of cubic curves of length h from a to b with unit tangents, and unit directions there."""
     d = b - a
     q = a + (3 * u * u - 2 * u**3) * d + h * ((u - 2 * u * u + u**3) * start + (u**3 - u * u) * end)
     slope = 6 * (u - u * u) * d + h * ((1 - 4 * u + 3 * u * u) * start + (3 * u * u - 2 * u) * end)

@@ -31,7 +31,7 @@ class Nearest:
         return cls(starts.copy(), np.full(len(starts), np.inf), np.zeros(len(starts), dtype=bool))
 
     def take(self, rows: Indices, q: Array, distance: Array, between: bool = False) -> None:
-        """Take over points (M, n) that are nearer than those of their rows (M,), which may occur several times."""
+        """Keep those points (M, n) that are nearer than the best so far of their rows (M,); a row may occur twice."""
         # what is written last stays
         farthest_first = np.argsort(-distance, kind="stable")
         better = farthest_first[distance[farthest_first] < self.distance[rows[farthest_first]]]

@@ -270,13 +270,13 @@ assert set(_ARRAYS) < {field.name for field in fields(Trajectory)}
 def find_loss(run: Trajectory, controller: Controller, pushes: Sequence[Push], supervised: bool) -> str:
     """Why a law lost its arm in a run, in words; empty if it kept it.
 
-    It lost the arm where the arm left the domain of the law's chart, in which alone the law commands; with a law
-    without a chart, where it left the joint limits. A supervised law may leave them and come back, and its catcher may
-    hold the arm outside.
+    A law loses its arm in two ways. The arm leaves the domain of the law's chart, outside of which the law commands
+    nothing; for a law without a chart, the joint limits. A supervised law may come back, and its catcher may hold the
+    arm outside.
 
-    It also lost the arm where motors were at their limit for a time, and the storage V, the energy of springs
-    and motion, was larger after that time than before. This counts at the end of the run, and where the catcher of a
-    supervised law had to take over meanwhile, without a push.
+    Or motors are at their limit for a time, after which the storage V, the energy of springs and motion, is larger than
+    before. This counts if that time lasts to the end of the run, or if the catcher of a supervised law took over during
+    it without a push.
 
     Args:
         run: the run, in the quantities of the law.
