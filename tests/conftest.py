@@ -124,6 +124,12 @@ def arm(name: str) -> tuple[pin.Model, str]:
     return full if "both arms" in name else pinocchio_model.lock_off_chain(full, tip), tip
 
 
+def robot_of(name: str) -> oc.Robot:
+    """The robot of one of ROBOTS."""
+    file, tip = ROBOTS[name]
+    return oc.Robot.from_urdf(robot_data(file), tip)
+
+
 def pinocchio_position(model: pin.Model, q: np.ndarray) -> np.ndarray:
     """Pinocchio's configuration: cos and sin for continuous joints."""
     position = pin.neutral(model)
