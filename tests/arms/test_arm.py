@@ -265,6 +265,7 @@ def test_full_turns_of_endless_joints_bring_postures_into_a_box() -> None:
     assert np.linalg.norm(near.q - q, axis=1).max() < 0.05
 
 
+@pytest.mark.slow
 def test_postures_at_which_a_closed_curve_begins_are_found() -> None:
     """Curves of these x begin at the postures themselves, which are stored, and there xi is met up to rounding."""
     known = oc.problems.get("planar_3r_xy")

@@ -36,6 +36,7 @@ def test_inside_gives_the_nearest_coordinates_that_keep_the_task(planar_arm: oc.
             assert len(inner) == 0
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["ur5-position", "pr2-left-wide"])
 def test_inside_finds_what_a_search_without_it_finds(name: str) -> None:
     """r > 1: all of these rows have solutions inside a box; of the part of one, both begin at the same places."""

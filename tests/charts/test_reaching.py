@@ -45,6 +45,7 @@ def test_self_motion_of_a_planar_arm_is_the_closed_form() -> None:
     np.testing.assert_allclose(motion.q, expected, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["panda-wide", "xarm7-pose", "circle"])
 def test_c_and_python_end_at_the_same_places(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without a C compiler, Python follows the curves: ranges agree to 1e-9, and so do ends of self-motions."""
@@ -85,6 +86,7 @@ def test_without_a_library_python_follows_the_curves(
     assert len(chart.xi_range(chart.domain.centre)) == 1
 
 
+@pytest.mark.slow
 def test_ranges_of_a_grown_chart_end_where_it_ends() -> None:
     """The curves of some postures leave the chart, those of others the domain."""
     chart, ends = disk(), set()
