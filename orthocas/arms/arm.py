@@ -571,23 +571,20 @@ class Arm(Shown):
         self, targets: Array, starts: Array | None, chosen: Sequence[int], anywhere: bool
     ) -> tuple[Array, Indices]:
         """Postures of targets (N, k) on their arcs, nearest to starts or far from limits, and how they ended."""
-        q = np.full((len(targets), self.robot.n), np.nan)
-        status = np.full(len(targets), int(InverseStatus.NOT_FOUND))
-        domains = [self.charts[k].problem.domain for k in chosen]
+        if anywhere:
+            q = self.maps.choose_postures(targets, starts)
+        else:
+            q = np.full((len(targets), self.robot.n), np.nan)
+            domains = [self.charts[k].problem.domain for k in chosen]
 
-        def solve_row(row: int) -> None:
-            start = None if starts is None else starts[row]
-            motions = find_motions(self.maps, targets[row], *(() if start is None else (start[None],)))
-            if not motions.components:
-                return
-            if anywhere:
-                q[row] = (motions.best(self._measure_room) if start is None else motions.nearest(start)).q
-            else:
-                q[row] = self._choose_inside(motions, domains, start)
-            status[row] = InverseStatus.FOUND if np.isfinite(q[row, 0]) else InverseStatus.NOT_FOUND
+            def solve_row(row: int) -> None:
+                start = None if starts is None else starts[row]
+                motions = find_motions(self.maps, targets[row], *(() if start is None else (start[None],)))
+                if motions.components:
+                    q[row] = self._choose_inside(motions, domains, start)
 
-        run_in_threads(solve_row, range(len(targets)))
-        return q, status
+            run_in_threads(solve_row, range(len(targets)))
+        return q, np.where(np.isfinite(q[:, 0]), int(InverseStatus.FOUND), int(InverseStatus.NOT_FOUND))
 
     def _choose_inside(self, motions: SelfMotions, domains: Sequence[Domain], start: Array | None) -> Array:
         """A posture in one of the domains, of those 0.05 rad apart on the arcs; NaN where there is none."""
