@@ -111,9 +111,7 @@ class CurveKernel:
         )
         return stored.q[chosen[:total]]
 
-    def choose_postures(
-        self, targets: Array, starts: Array | None, stored: StoredPostures, places: Array, patience: int = RULES.patience
-    ) -> Array:
+    def choose_postures(self, targets: Array, starts: Array | None, stored: StoredPostures, places: Array) -> Array:
         """Postures (N, n) within the limits of targets (N, k), nearest to starts (N, n), or farthest from the limits.
 
         They are the best ones on all curves that stored postures and starts lead to; NaN where there is none.
@@ -135,7 +133,8 @@ class CurveKernel:
             own = [pointer(part[rows]) for part in inputs]
             self._c.choose_rows(
                 *(len(q[rows]), own[0], targets.shape[1], own[1], None if first is None else pointer(first[rows])),
-                *(*known, branches, len(stored.places), len(stored.q), patience, *map(pointer, memory), pointer(q[rows])),
+                *(*known, branches, len(stored.places), len(stored.q), RULES.patience),
+                *(*map(pointer, memory), pointer(q[rows])),
             )
 
         run_in_threads(choose_piece, range(0, count, RULES.piece))

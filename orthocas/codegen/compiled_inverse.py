@@ -21,6 +21,7 @@ from orthocas.charts.newton import NEWTON, Attempt, Newton
 from orthocas.codegen.generate import generate_c
 from orthocas.codegen.rendering import get_source, render
 from orthocas.native import rendering
+from orthocas.native.curves import RULES as CURVES
 from orthocas.native.libraries import keep_library, load_library, pointer
 from orthocas.tools.batch import run_in_threads
 from orthocas.tools.cached import cached_property
@@ -73,7 +74,8 @@ def compile_inverse(chart: Chart, folder: str | Path | None = None) -> CompiledI
     sources[_ROWS] = get_source(_ROWS)
     curves = chart.parts.inverse.curves
     if curves is not None:
-        sources |= {"curve_rows.c": get_source("curve_rows.c"), "curve_math.c": rendering.get_source("curve_math.c")}
+        sources |= {"curve_rows.c": get_source("curve_rows.c")}
+        sources |= {name: rendering.get_source(name) for name in ("self_motion.c", "curve_math.c")}
         sources["curves.c"] = write_curve_source(chart, curves)
     return CompiledInverse(chart, keep_library("inverse", sources, (*_FLAGS, f"-DN={chart.n}"), folder))
 
@@ -90,9 +92,8 @@ def write_curve_source(chart: Chart, curves: SelfMotionCurves) -> str:
         "kernels": kernels.code,
         "arrays": kernels.declare_arrays,
         "call": kernels.write_call,
-        "m": chart.m,
-        "starts": _STARTS,
-        "rules": asdict(RULES),
+        "rules": asdict(CURVES) | {"starts": _STARTS},
+        "row_rules": asdict(RULES),
         "xi_size": float(chart.parts.phi_sizes[chart.m]),
         "period": float(chart.parts.turns[chart.m]),
         "low": low,

@@ -1,16 +1,14 @@
 /* The nearest xi along self-motion curves, one row after the other: the search of orthocas/charts/curves.py, which says
- * what is done and why. curves.c includes it behind the kernels, tables and rules of a chart. */
-#define POINTS (2 * MOST + 3)
-#define CURVES STARTS
+ * what is done and why, on the curves of native/runtime/self_motion.c. curves.c includes both behind the kernels, tables
+ * and rules of a chart. */
 #define SHEETS 256
 #define ENDS 64
 
-#include "curve_math.c"
-
+/* A node of a curve after full turns of its joints: what is left of xi, and where it lies. */
 typedef struct {
-  double q[POINTS][N], t[POINTS][N];
-  int first, last; /* the points in use */
-} curve_points;
+  double q[N], left;
+  char near, inside, matters;
+} looked;
 
 typedef struct {
   double inside[N], outside[N], least;
@@ -21,6 +19,7 @@ typedef struct {
   double tolerance, q[N], distance;
   int between, ends;
   arc_end end[ENDS];
+  looked *room; /* as many as nodes */
 } row_search;
 
 /* xi - xi(q), by the shorter way around. */
@@ -38,138 +37,6 @@ static int in_box(const double *q, double slack) {
 
 static int contains(const double *q) { return in_box(q, 0.0) && is_clear(q); }
 
-/* dq with J dq = e, t . dq = 0, and the one with J dq = 0, t . dq = 1. */
-static void bordered(const double *J, const double *e, const double *t, double *change, double *onward) {
-  double A[N][N + 2];
-  int i, j;
-  for (i = 0; i < M; ++i) {
-    for (j = 0; j < N; ++j) A[i][j] = J[i + M * j];
-    A[i][N] = e[i];
-    A[i][N + 1] = 0.0;
-  }
-  for (j = 0; j < N; ++j) A[M][j] = t[j];
-  A[M][N] = 0.0;
-  A[M][N + 1] = 1.0;
-  if (eliminate(A, N, 2) == 0)
-    for (i = 0; i < N; ++i) A[i][N] = A[i][N + 1] = NAN; /* singular: the step is not finite */
-  for (i = 0; i < N; ++i) {
-    change[i] = A[i][N];
-    onward[i] = A[i][N + 1];
-  }
-}
-
-/* Damped least squares to x, whatever the limits; whether it arrives near x. */
-static int reach_x(double *q, const double *x) {
-  int round, i, j, k;
-  for (round = 0; round < REACH; ++round) {
-    double e[M], J[M * N], A[N][N + 2], step[N], trace = 0.0, size, damping;
-    const double error = task_at(q, x, e, J);
-    if (!isfinite(error)) return 0;
-    for (i = 0; i < M; ++i) {
-      for (j = 0; j < M; ++j) {
-        A[i][j] = 0.0;
-        for (k = 0; k < N; ++k) A[i][j] += J[i + M * k] * J[j + M * k];
-      }
-      A[i][M] = e[i];
-      trace += A[i][i];
-    }
-    damping = (error > 0.1 ? 1e-2 : error > 1e-3 ? 1e-5 : 1e-14) * trace;
-    for (i = 0; i < M; ++i) A[i][i] += damping;
-    if (eliminate(A, M, 1) == 0) return 0;
-    for (k = 0; k < N; ++k) {
-      step[k] = 0.0;
-      for (i = 0; i < M; ++i) step[k] += J[i + M * k] * A[i][M];
-    }
-    size = sqrt(dot(step, step));
-    for (k = 0; k < N; ++k) q[k] += fmin(1.0, LARGEST / (size + 1e-300)) * step[k];
-    if (error <= REACHED) return 1;
-  }
-  return 0;
-}
-
-/* Follow a curve from its point `at` in one direction; whether it closes. */
-static int follow(curve_points *curve, int direction, const double *x) {
-  const double sign = direction;
-  double q[N], t[N], q0[N], t0[N], bend[N] = {0}, h = STEP / 2, before = 0.0;
-  int *at = direction > 0 ? &curve->last : &curve->first, step, i, count = 1;
-  for (i = 0; i < N; ++i) {
-    q[i] = q0[i] = curve->q[*at][i];
-    t[i] = t0[i] = sign * curve->t[*at][i];
-  }
-  for (step = 0; step < MOST; ++step) {
-    double ahead[N], e[M], J[M * N], change[N], onward[N], missed, size, turned, gap = 0.0, along = 0.0;
-    for (i = 0; i < N; ++i) ahead[i] = q[i] + h * t[i] + h * h / 2 * bend[i];
-    task_at(ahead, x, e, J);
-    bordered(J, e, t, change, onward);
-    missed = sqrt(dot(change, change));
-    size = sqrt(dot(onward, onward));
-    turned = dot(t, onward) / size;
-    if (!(missed < MISSED && turned > TURNED)) {
-      h /= 2;
-      if (h <= SHORTEST) return 0;
-      continue;
-    }
-    *at += direction;
-    for (i = 0; i < N; ++i) {
-      const double new_t = onward[i] / size;
-      double away;
-      bend[i] = (new_t - t[i]) / h;
-      q[i] = ahead[i] + change[i];
-      t[i] = new_t;
-      curve->q[*at][i] = q[i];
-      curve->t[*at][i] = sign * new_t;
-      away = turned_back(q[i] - q0[i], i);
-      gap += away * away;
-      along += away * t0[i];
-    }
-    if (sqrt(gap) < 1.6 * STEP && before < 0 && along >= 0 && count > 3) return 1;
-    ++count;
-    before = along;
-    if (turned > STRAIGHT) h = fmin(1.6 * h, STEP);
-    for (i = 0; i < N; ++i)
-      if (!turning[i] && (q[i] < low[i] - PRISMATIC * half_width[i] || q[i] > high[i] + PRISMATIC * half_width[i])) return 0;
-  }
-  return 0;
-}
-
-/* The curve through q, from end to end. */
-static void trace_curve(curve_points *curve, const double *q, const double *x) {
-  double e[M], J[M * N], change[N], onward[N], side[N], best = 0.0;
-  int i, k;
-  curve->first = curve->last = MOST + 1;
-  memcpy(curve->q[curve->first], q, sizeof side);
-  task_at(q, x, e, J);
-  for (k = 0; k < N && best < 0.4; ++k) { /* a unit vector has an entry of 0.37 or more, if N is 7 */
-    double size;
-    memset(side, 0, sizeof side);
-    side[k] = 1.0;
-    bordered(J, e, side, change, onward);
-    size = sqrt(dot(onward, onward));
-    if (!(1.0 / size > best)) continue;
-    best = 1.0 / size;
-    for (i = 0; i < N; ++i) curve->t[curve->first][i] = onward[i] / size;
-  }
-  if (best > 0.0 && !follow(curve, 1, x)) follow(curve, -1, x);
-}
-
-/* Whether q lies on the curve, up to full turns. */
-static int on_curve(const curve_points *curve, const double *q) {
-  int p, i;
-  for (p = curve->first; p < curve->last || p == curve->first; ++p) {
-    double away[N], step[N], square = 0.0, share, gap = 0.0;
-    for (i = 0; i < N; ++i) {
-      away[i] = turned_back(q[i] - curve->q[p][i], i);
-      step[i] = p < curve->last ? curve->q[p + 1][i] - curve->q[p][i] : 0.0;
-      square += away[i] * away[i];
-    }
-    if (square > (STEP + 2 * KNOWN) * (STEP + 2 * KNOWN)) continue;
-    share = fmin(1.0, fmax(0.0, dot(away, step) / fmax(dot(step, step), 1e-300)));
-    for (i = 0; i < N; ++i) gap += (away[i] - share * step[i]) * (away[i] - share * step[i]);
-    if (gap < KNOWN * KNOWN) return 1;
-  }
-  return 0;
-}
-
 static void take(row_search *row, const double *q, double distance, int between) {
   if (!(distance < row->distance)) return;
   memcpy(row->q, q, sizeof row->q);
@@ -182,11 +49,11 @@ static void take_solution(row_search *row, const double *start) {
   double q[N], e[M], J[M * N], A[N][N + 2], gradient[N] = {0}, left = 0.0, error;
   int round, i, j, near = 1;
   memcpy(q, start, sizeof q);
-  for (round = 0; round <= NEWTON; ++round) {
+  for (round = 0; round <= ROW_NEWTON; ++round) {
     error = task_at(q, row->target, e, J);
     left = xi_left(row->target, q);
     gradient_at(q, gradient);
-    if (round == NEWTON || fmax(error, fabs(left) / XI_SIZE) < 1e-14 || !isfinite(error) || !isfinite(left)) break;
+    if (round == ROW_NEWTON || fmax(error, fabs(left) / XI_SIZE) < 1e-14 || !isfinite(error) || !isfinite(left)) break;
     for (i = 0; i < M; ++i) {
       for (j = 0; j < N; ++j) A[i][j] = J[i + M * j];
       A[i][N] = e[i];
@@ -196,7 +63,7 @@ static void take_solution(row_search *row, const double *start) {
     if (eliminate(A, N, 1) == 0) return;
     for (i = 0; i < N; ++i) q[i] += A[i][N];
   }
-  for (i = 0; i < N; ++i) near = near && fabs(q[i] - fmin(fmax(q[i], low[i]), high[i])) <= SNAP * half_width[i];
+  for (i = 0; i < N; ++i) near = near && fabs(q[i] - fmin(fmax(q[i], low[i]), high[i])) <= ROW_SNAP * half_width[i];
   if (!near) return;
   for (i = 0; i < N; ++i) q[i] = fmin(fmax(q[i], low[i]), high[i]);
   error = fmax(task_at(q, row->target, e, J), fabs(xi_left(row->target, q)) / XI_SIZE);
@@ -217,11 +84,12 @@ static int shares_inside(const double *a, const double *b, double slack, double 
   return *first < *last;
 }
 
-static void correct(double *q, const double *x, const double *along) {
-  double e[M], J[M * N], change[N], onward[N];
+/* Newton's step from q to the curve across a direction; NaN where there is none. */
+static void correct(double *q, const double *target, const double *along) {
+  double e[M], J[M * N], change[N] = {0.0}, t[N];
   int i;
-  task_at(q, x, e, J);
-  bordered(J, e, along, change, onward);
+  task_at(q, target, e, J);
+  if (!bordered(J, e, along, 0.0, change, t)) change[0] = NAN;
   for (i = 0; i < N; ++i) q[i] += change[i];
 }
 
@@ -238,7 +106,7 @@ static void add_end(row_search *row, const double *inside, const double *outside
 static void take_short(row_search *row, const double *a, const double *b, int level, double slack) {
   double q[N], along[N], first, last;
   int i;
-  if (level == HALVINGS || !shares_inside(a, b, slack, &first, &last)) return;
+  if (level == ROW_HALVINGS || !shares_inside(a, b, slack, &first, &last)) return;
   for (i = 0; i < N; ++i) {
     along[i] = b[i] - a[i];
     q[i] = a[i] + (first + last) / 2 * along[i];
@@ -268,7 +136,7 @@ static void take_end(row_search *row, const arc_end *end) {
       middle[i] = (a[i] + b[i]) / 2;
       width = fmax(width, fabs(along[i]));
     }
-    if (!(width > NARROW)) break;
+    if (!(width > ROW_NARROW)) break;
     size = sqrt(dot(along, along));
     for (i = 0; i < N; ++i) along[i] /= size;
     correct(middle, row->target, along);
@@ -277,18 +145,11 @@ static void take_end(row_search *row, const arc_end *end) {
   take(row, a, fabs(xi_left(row->target, a)), 0);
 }
 
-/* A point on the cubic curve of a step, at a share of the way, and the direction there. */
-static void on_cubic(const curve_points *curve, int p, const double *shift, double s, double *q, double *along) {
-  const double *a = curve->q[p], *b = curve->q[p + 1], *t = curve->t[p], *onward = curve->t[p + 1];
-  double size = 0.0;
+/* A point on the cubic of a step after full turns, and the direction there. */
+static void point_after(const node *at, const double *shift, double share, double *q, double *along) {
   int i;
-  for (i = 0; i < N; ++i) size += (b[i] - a[i]) * (b[i] - a[i]);
-  size = sqrt(size);
-  for (i = 0; i < N; ++i) {
-    const double bend = (s - 2 * s * s + s * s * s) * t[i] + (s * s * s - s * s) * onward[i];
-    q[i] = a[i] + shift[i] + (3 * s * s - 2 * s * s * s) * (b[i] - a[i]) + size * bend;
-    along[i] = (1 - s) * t[i] + s * onward[i];
-  }
+  point_on(at, at + 1, share, q, along);
+  for (i = 0; i < N; ++i) q[i] += shift[i];
 }
 
 static int crosses(double a, double b) { return a * b <= 0.0 && !(fabs(b - a) > PERIOD / 2); }
@@ -296,23 +157,23 @@ static int crosses(double a, double b) { return a * b <= 0.0 && !(fabs(b - a) > 
 static double share_of(double a, double b) { return a == b ? 0.0 : a / (a - b); }
 
 /* Look closely at a step: roots, points and ends. */
-static void look_closely(row_search *row, const curve_points *curve, int p, const double *shift) {
-  double q[PARTS + 1][N], along[N], left[PARTS + 1], first, last;
-  int close[PARTS + 1], inside[PARTS + 1], passing, k, i;
-  for (k = 0; k <= PARTS; ++k) {
-    on_cubic(curve, p, shift, (double)k / PARTS, q[k], along);
+static void look_closely(row_search *row, const node *at, const double *shift) {
+  double q[ROW_PARTS + 1][N], along[N], left[ROW_PARTS + 1], first, last;
+  int close[ROW_PARTS + 1], inside[ROW_PARTS + 1], passing, k, i;
+  for (k = 0; k <= ROW_PARTS; ++k) {
+    point_after(at, shift, (double)k / ROW_PARTS, q[k], along);
     inside[k] = 0;
     left[k] = NAN;
-    close[k] = in_box(q[k], STEP / PARTS);
+    close[k] = in_box(q[k], STEP / ROW_PARTS);
     if (!close[k]) continue;
     correct(q[k], row->target, along);
-    if (in_box(q[k], SAGITTA)) correct(q[k], row->target, along);
+    if (in_box(q[k], ROW_SAGITTA)) correct(q[k], row->target, along);
     inside[k] = contains(q[k]);
     left[k] = xi_left(row->target, q[k]);
   }
-  for (k = 0; k < PARTS; ++k) {
+  for (k = 0; k < ROW_PARTS; ++k) {
     passing = close[k] && close[k + 1] && !inside[k] && !inside[k + 1] &&
-              shares_inside(q[k], q[k + 1], SAGITTA, &first, &last);
+              shares_inside(q[k], q[k + 1], ROW_SAGITTA, &first, &last);
     if ((passing || inside[k] || inside[k + 1]) && crosses(left[k], left[k + 1])) {
       const double share = share_of(left[k], left[k + 1]);
       double start[N];
@@ -320,70 +181,69 @@ static void look_closely(row_search *row, const curve_points *curve, int p, cons
       take_solution(row, start);
     }
     if (!(row->distance > 0.0)) return;
-    if (passing) take_short(row, q[k], q[k + 1], 0, SAGITTA);
+    if (passing) take_short(row, q[k], q[k + 1], 0, ROW_SAGITTA);
     if (inside[k] != inside[k + 1] && isfinite(left[k]) && isfinite(left[k + 1])) {
       const double least = left[k] * left[k + 1] > 0 ? fmin(fabs(left[k]), fabs(left[k + 1])) : 0.0;
       if (inside[k]) add_end(row, q[k], q[k + 1], least);
       else add_end(row, q[k + 1], q[k], least);
     }
   }
-  for (k = 0; k <= PARTS; ++k)
+  for (k = 0; k <= ROW_PARTS; ++k)
     if (inside[k]) take(row, q[k], fabs(left[k]), 1);
 }
 
-/* Look for the target on a curve after some full turns. */
-static void search_sheet(row_search *row, const curve_points *curve, const double *shift) {
-  double q[POINTS][N], left[POINTS];
-  char near[POINTS], inside[POINTS], matters[POINTS];
-  const int count = curve->last - curve->first + 1;
+/* Look for the target on a curve of some nodes after some full turns. */
+static void search_sheet(row_search *row, const node *curve, int count, const double *shift) {
+  looked *at = row->room;
   double turned = 0.0;
   int p, i;
   for (p = 0; p < count; ++p) {
-    for (i = 0; i < N; ++i) q[p][i] = curve->q[curve->first + p][i] + shift[i];
-    near[p] = (char)in_box(q[p], STEP);
-    left[p] = in_box(q[p], STEP / PARTS) ? xi_left(row->target, q[p]) : NAN;
+    for (i = 0; i < N; ++i) at[p].q[i] = curve[p].q[i] + shift[i];
+    at[p].near = (char)in_box(at[p].q, STEP);
+    at[p].left = in_box(at[p].q, STEP / ROW_PARTS) ? xi_left(row->target, at[p].q) : NAN;
   }
   for (p = 0; p + 1 < count; ++p)
-    if (crosses(left[p], left[p + 1])) {
+    if (crosses(at[p].left, at[p + 1].left)) {
       double start[N], along[N];
-      on_cubic(curve, curve->first + p, shift, share_of(left[p], left[p + 1]), start, along);
+      point_after(curve + p, shift, share_of(at[p].left, at[p + 1].left), start, along);
       take_solution(row, start);
       if (!(row->distance > 0.0)) return;
     }
-  for (p = 0; p < count; ++p) inside[p] = (char)(near[p] && contains(q[p]));
+  for (p = 0; p < count; ++p) at[p].inside = (char)(at[p].near && contains(at[p].q));
   for (p = 0; p + 1 < count; ++p) {
     double first, last, ahead;
-    matters[p] = 0;
-    if (!near[p] && !near[p + 1]) continue;
-    if (inside[p] && inside[p + 1]) {
-      ahead = left[p + 1] - left[p];
+    at[p].matters = 0;
+    if (!at[p].near && !at[p + 1].near) continue;
+    if (at[p].inside && at[p + 1].inside) {
+      ahead = at[p + 1].left - at[p].left;
       if (isfinite(PERIOD)) ahead -= PERIOD * round(ahead / PERIOD);
       /* xi may turn back where a curve begins, as Newton's method ends at such points. */
-      matters[p] = (char)(crosses(left[p], left[p + 1]) || p == 0 || p + 2 == count ||
-                          (inside[p - 1] && !(ahead * turned > 0)));
+      at[p].matters = (char)(crosses(at[p].left, at[p + 1].left) || p == 0 || p + 2 == count ||
+                             (at[p - 1].inside && !(ahead * turned > 0)));
       turned = ahead;
     } else {
-      matters[p] = (char)(inside[p] || inside[p + 1] || shares_inside(q[p], q[p + 1], MISSED, &first, &last));
+      at[p].matters =
+          (char)(at[p].inside || at[p + 1].inside || shares_inside(at[p].q, at[p + 1].q, MISSED, &first, &last));
     }
   }
   for (p = 0; p + 1 < count; ++p) {
-    int around = matters[p];
-    if (!around && inside[p] && inside[p + 1])
-      around = (p > 0 && matters[p - 1]) || (p + 2 < count && matters[p + 1]);
-    if (around) look_closely(row, curve, curve->first + p, shift);
+    int around = at[p].matters;
+    if (!around && at[p].inside && at[p + 1].inside)
+      around = (p > 0 && at[p - 1].matters) || (p + 2 < count && at[p + 1].matters);
+    if (around) look_closely(row, curve + p, shift);
     if (!(row->distance > 0.0)) return;
   }
 }
 
 /* Look for the target on a curve after all full turns that bring points of it near the box. */
-static void search_curve(row_search *row, const curve_points *curve) {
+static void search_curve(row_search *row, const node *curve, int points) {
   double sheets[SHEETS][N], lowest_before[N], highest_before[N];
   int count = 0, p, i, s, fresh = 1;
-  for (p = curve->first; p <= curve->last; ++p) {
+  for (p = 0; p < points; ++p) {
     double lowest[N], highest[N], turns[N];
     int near = 1, same = !fresh;
     for (i = 0; i < N && near; ++i) {
-      const double q = curve->q[p][i];
+      const double q = curve[p].q[i];
       lowest[i] = highest[i] = 0.0;
       if (turning[i] && bounded[i]) {
         lowest[i] = ceil((low[i] - STEP - q) / TURN);
@@ -417,7 +277,7 @@ static void search_curve(row_search *row, const curve_points *curve) {
       turns[i] += 1.0;
     }
   }
-  for (s = 0; s < count && row->distance > 0.0; ++s) search_sheet(row, curve, sheets[s]);
+  for (s = 0; s < count && row->distance > 0.0; ++s) search_sheet(row, curve, points, sheets[s]);
 }
 
 /* Largest distance of a joint from its range, up to full turns. */
@@ -431,49 +291,52 @@ static double away_from_box(const double *q) {
 
 /* Search from some starts (count, N), and add to the curves, `curves` in number, that are traced; returns their number.
  */
-static int search_from(row_search *row, const double *starts, int count, curve_points *traced, int curves) {
-  double q[STARTS][N], away[STARTS];
+static int search_from(row_search *row, const double *starts, int count, node *nodes, int *ends, int curves) {
+  double q[STARTS][N], t[STARTS][N], away[STARTS];
   char known[STARTS];
-  int s, k;
+  int s;
   for (s = 0; s < count; ++s) {
     memcpy(q[s], starts + s * N, sizeof q[s]);
-    known[s] = (char)!reach_x(q[s], row->target);
-    for (k = 0; k < curves && !known[s]; ++k) known[s] = (char)on_curve(&traced[k], q[s]);
+    known[s] = (char)(!reach(q[s], row->target, t[s]) || find_curve(nodes, ends, curves, q[s], t[s], row->target) >= 0);
     away[s] = away_from_box(q[s]);
   }
   while (curves < CURVES) {
-    int best = -1;
+    int best = -1, total = curves ? ends[curves - 1] : 0, found, closed;
     for (s = 0; s < count; ++s)
       if (!known[s] && (best < 0 || away[s] < away[best])) best = s;
-    if (best < 0) break;
-    trace_curve(&traced[curves], q[best], row->target);
-    search_curve(row, &traced[curves]);
-    if (!(row->distance > 0.0)) break;
+    if (best < 0 || total + 8 > NODES) break;
     known[best] = 1;
-    for (s = 0; s < count; ++s) known[s] = (char)(known[s] || on_curve(&traced[curves], q[s]));
-    ++curves;
+    found = trace(nodes + total, NODES - total, q[best], t[best], row->target, &closed);
+    if (found < 2) continue;
+    ends[curves++] = total + found;
+    search_curve(row, nodes + total, found);
+    if (!(row->distance > 0.0)) break;
+    for (s = 0; s < count; ++s)
+      known[s] = (char)(known[s] || find_curve(nodes + total, &found, 1, q[s], t[s], row->target) >= 0);
   }
   return curves;
 }
 
 /* The nearest points for rows of targets: q, |xi - xi(q)| (infinite where there is none), and whether q is neither a
  * solution nor an end of an arc. Of the starts (rows, count, N), those after the `first` ones serve rows without a
- * solution; count is at most STARTS. `traced` has `curve_room()` bytes. */
+ * solution; count is at most STARTS. `room` has `curve_room()` bytes. */
 void curve_rows(long rows, const double *targets, const double *starts, long first, long count, double tolerance,
-                void *traced, double *q, double *distance, char *between) {
+                void *room, double *q, double *distance, char *between) {
+  node *nodes = (node *)room;
   long k;
   for (k = 0; k < rows; ++k) {
     const double *from = starts + k * count * N;
     row_search row;
-    int curves, end;
+    int curves, ends[CURVES], end;
     row.target = targets + k * N;
     row.own = from;
     row.tolerance = tolerance;
     row.distance = INFINITY;
     row.between = row.ends = 0;
+    row.room = (looked *)(nodes + NODES);
     memcpy(row.q, from, sizeof row.q);
-    curves = search_from(&row, from, (int)first, traced, 0);
-    if (row.distance > 0.0) search_from(&row, from + first * N, (int)(count - first), traced, curves);
+    curves = search_from(&row, from, (int)first, nodes, ends, 0);
+    if (row.distance > 0.0) search_from(&row, from + first * N, (int)(count - first), nodes, ends, curves);
     while (row.distance > 0.0) {
       int next = -1;
       for (end = 0; end < row.ends; ++end)
@@ -488,4 +351,4 @@ void curve_rows(long rows, const double *targets, const double *starts, long fir
   }
 }
 
-unsigned long curve_room(void) { return CURVES * sizeof(curve_points); }
+unsigned long curve_room(void) { return NODES * (sizeof(node) + sizeof(looked)); }
