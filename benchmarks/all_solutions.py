@@ -66,10 +66,11 @@ def newton(chart: oc.Chart, posture: Array, q: Array) -> Array:
         y = np.linalg.solve(gram + damping[:, None, None] * np.eye(robot.n), e[:, :, None])
         step = (rows.transpose(0, 2, 1) @ y)[:, :, 0]
         q = q + step * np.minimum(1.0, LONGEST / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-300))
-    # Full turns that bring ends within the limits do not change the pose, and what they do to xi is looked at again.
-    bounded = np.isfinite(robot.lower)
-    done[:, bounded] = robot.lower[bounded] + (done[:, bounded] - robot.lower[bounded]) % (2 * np.pi)
-    done = done[((done >= robot.lower) & (done <= robot.upper)).all(axis=1)]
+    done = np.array(list_different(robot, wrap_shortest(done, np.full(robot.n, 2 * np.pi)))).reshape(-1, robot.n)
+    # Full turns within the limits do not change the pose; what they do to xi is looked at again.
+    for k in np.flatnonzero(np.isfinite(robot.lower)):
+        done = np.vstack([done + turns * 2 * np.pi * np.eye(robot.n)[k] for turns in (-1, 0, 1)])
+        done = done[(done[:, k] >= robot.lower[k]) & (done[:, k] <= robot.upper[k])]
     done = done[(np.abs(wrap_shortest(xi - chart.xi(done), period)) < MET).all(axis=1)] if len(done) else done
     done = done[np.asarray(chart.domain.contains(done))] if len(done) else done
     return np.array(list_different(robot, done)).reshape(-1, robot.n)

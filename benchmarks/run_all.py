@@ -56,6 +56,7 @@ SCRIPTS = (
     "beyond_reach",
     "collisions",
     "arm",
+    "all_solutions",
     "default_gains",
     "safety",
     "faults",

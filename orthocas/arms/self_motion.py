@@ -138,7 +138,7 @@ class Arc(Shown):
 
     def direction(self, place: float) -> Array:
         """The direction of the arc (n,) at a length from its begin."""
-        return self._stand(np.array([min(max(place, 0.0), self.length)]))[1][0]
+        return np.asarray(self._stand(np.array([min(max(place, 0.0), self.length)]))[1][0])
 
     def _stand(self, places: Array) -> tuple[Array, Array]:
         """Postures (P, n) at places from end to end, and directions there."""
