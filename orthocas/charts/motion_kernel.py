@@ -98,7 +98,7 @@ class SearchKernel:
     chart: Chart
     folder: Path | None = None  #: where its library is kept; None: as `keep_library`
 
-    def search(self, targets: Array, starts: Array, first: int, tolerance: float) -> tuple[Array, Array, Array]:
+    def search(self, targets: Array, starts: Array, first: int, tolerance: float) -> tuple[Array, Array, Any]:
         """As `SelfMotionCurves.search`, for starts (N, S, n); those after the `first` ones serve unsolved rows.
 
         Returns:
