@@ -57,6 +57,7 @@ SCRIPTS = (
     "collisions",
     "arm",
     "all_solutions",
+    "arm_batches",
     "default_gains",
     "safety",
     "faults",
