@@ -218,6 +218,25 @@ def test_fold_stops_a_coordinate() -> None:
     assert reach.high >= motion.xi[high, 0]
 
 
+@pytest.mark.parametrize("kind", ["torus", "box"])
+def test_extent_does_not_depend_on_the_points_of_the_curve(kind: str) -> None:
+    """Where xi turns back between points, the extent is that of a dense search around the largest and least point."""
+    robot = oc.Robot.planar([1.0] * LINKS, [3.0] * LINKS)
+    domain = oc.Torus(LINKS) if kind == "torus" else oc.Box([0.6, 0.8, 0.8], 2.2)
+    problem = oc.Problem(robot, oc.Task.position(robot, "xy"), domain=domain)
+    chart = oc.fit(problem, oc.Linear(base=(0.6, 0.8, 0.8))).chart
+    q = np.array([0.6, 0.8, 0.8])
+    rough, fine = (chart.self_motion(q, step=step) for step in (0.5, 1e-3))
+    assert isinstance(fine, SelfMotionCurve)
+    assert fine.folds > 0
+    for motion in (rough, fine):
+        # Points are 1e-3 apart, so the parabola through them rises by 1e-6 at most.
+        assert 0 <= motion.extent.high[0] - fine.xi.max() < 1e-6
+        assert 0 <= fine.xi.min() - motion.extent.low[0] < 1e-6
+    np.testing.assert_allclose(rough.extent.low, fine.extent.low, atol=1e-9)
+    np.testing.assert_allclose(rough.extent.high, fine.extent.high, atol=1e-9)
+
+
 def test_joint_limits_are_told_from_other_boundaries() -> None:
     arm = oc.Robot.planar([1.0] * LINKS, [3.0] * LINKS)
     robot = oc.Robot(replace(arm.tree, lower=np.array([-np.inf, -np.inf, 0.5])))

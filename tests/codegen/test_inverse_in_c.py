@@ -60,7 +60,7 @@ def test_targets_may_have_any_order_in_memory(planar_arm: oc.Chart, tmp_path: Pa
 def test_a_library_is_compiled_once(planar_arm: oc.Chart, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
     first = oc.compile_inverse(planar_arm)
-    (library,) = (tmp_path / "orthocas" / "libraries").glob("*.so")
+    (library,) = (tmp_path / "orthocas" / "libraries").glob("inverse-*.so")
     assert stat.S_IMODE(library.parent.stat().st_mode) == 0o700
     written = library.stat().st_mtime_ns
     again = oc.compile_inverse(planar_arm)
