@@ -37,7 +37,8 @@ WIDE = (
 NETWORKS = (
     "| arm, A = I | network of 24, without the last joint (default) | leak rms [deg] | polynomial without it "
     "| leak rms [deg] | network of 64, without it | leak rms [deg] | network of 64, all joints | leak rms [deg] |\n|"
-    + " --- |" * 9
+    + " --- |"
+    * 9
 )
 WEIGHTS = oc.Weights(folds=0.0, angles="paper")
 
