@@ -38,7 +38,7 @@ class WideRules:
     degree: int = 6  #: of polynomials that are linear in base and tool joints
     degree_of_all: int = 5  #: of polynomials in which these count like all others
     network: tuple[int, ...] = (64, 64, 64)  #: layers where polynomials leave out much
-    small_network: tuple[int, ...] = (24, 24, 24)  #: layers of those that leave out joints; as fast as polynomials
+    small_network: tuple[int, ...] = (24, 24, 24)  #: layers of those that leave out joints
 
     alignment: float = 0.3  #: weight of the mean sin^2 of the leaks
     alignment_in_metric: float = 1.0  #: the same in another metric than the identity
