@@ -1,7 +1,11 @@
-"""What benchmarks share as programs: tables whose rows appear as they come, and the option --quick."""
+"""What benchmarks share as programs: tables whose rows appear as they come, times of calls, the option --quick."""
 
 import argparse
+import time
 from collections.abc import Callable, Iterable
+from typing import TypeVar
+
+T = TypeVar("T")
 
 
 def table(header: str, rows: Iterable[str]) -> list[str]:
@@ -12,6 +16,16 @@ def table(header: str, rows: Iterable[str]) -> list[str]:
         print(row, flush=True)
         found.append(row)
     return found
+
+
+def timed(work: Callable[[], T], calls: int) -> tuple[list[float], T]:
+    """Seconds of each call, and the last result."""
+    seconds = []
+    for _ in range(calls):
+        start = time.perf_counter()
+        result = work()
+        seconds.append(time.perf_counter() - start)
+    return seconds, result
 
 
 def run(main: Callable[[bool], object], about: str | None) -> None:

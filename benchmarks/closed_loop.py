@@ -10,7 +10,7 @@ from collections.abc import Callable
 from statistics import median
 
 import numpy as np
-from benchmark import run
+from benchmark import run, timed
 from scipy.integrate import solve_ivp
 
 import orthocas as oc
@@ -57,16 +57,6 @@ def by_scipy(law: PDPlus, reference: Reference) -> Array:
     return np.asarray(state[:n])
 
 
-def timed(work: Callable[[], Array], rounds: int) -> tuple[float, Array]:
-    """Median seconds, and the result."""
-    seconds = []
-    for _ in range(rounds):
-        start = time.perf_counter()
-        result = work()
-        seconds.append(time.perf_counter() - start)
-    return median(seconds), result
-
-
 def of_robots(law: PDPlus, reference: Reference, q0: Array) -> tuple[oc.simulation.Trajectory, ...]:
     """Runs with 20 robots of different masses, the last one as in the law's model."""
     changes = [{"plant": law.problem.robot.with_scaled_masses(scale)} for scale in np.linspace(0.99, 1.0, 20)]
@@ -103,7 +93,8 @@ def main(quick: bool = False) -> dict[str, float]:
         found[f"{name} first compiled run"] = time.perf_counter() - begin
         exact = oc.simulate(law, reference, q0, tolerance=1e-12).q[-1]
         for kind, work in runs(law, reference, q0).items():
-            seconds, end = timed(work, 1 if kind == "SciPy LSODA" else rounds)
+            each, end = timed(work, 1 if kind == "SciPy LSODA" else rounds)
+            seconds = median(each)
             found[f"{name} {kind}"] = seconds
             found[f"{name} {kind} error"] = float(np.abs(end - exact).max())
         cells = " | ".join(f"{found[f'{name} {kind}']:.3f}" for kind in SHOWN)

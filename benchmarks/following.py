@@ -4,12 +4,8 @@ Times are the best of three calls of the same chart; charts are fitted before. A
 "closed to" is the distance of the last joint position from the first.
 """
 
-import time
-from collections.abc import Callable
-from typing import TypeVar
-
 import numpy as np
-from benchmark import run
+from benchmark import run, timed
 
 import orthocas as oc
 from orthocas import problems
@@ -18,7 +14,6 @@ from orthocas.robots.collisions import Collisions
 from orthocas.robots.obstacles import Sphere
 from orthocas.tools.checks import Array
 
-T = TypeVar("T")
 HEADER = (
     "| chart, path | xi | seconds | duration [s] | share of speed, acceleration limits | boundary [half-widths] "
     "| obstacle [m] | tool error | closed to [rad] |\n| --- | --- | --- | --- | --- | --- | --- | --- | --- |"
@@ -53,7 +48,8 @@ def raster(chart: oc.Chart, poses: int) -> Array:
 def row(name: str, chart: oc.Chart, path: Array, xi: str, around: Collisions | None, calls: int) -> str:
     """One path; the least time of some calls."""
     clearance = 0.0 if around is None else 0.01
-    seconds, motion = _best(lambda: oc.follow(chart, path, xi, collisions=around, clearance=clearance), calls)
+    each, motion = timed(lambda: oc.follow(chart, path, xi, collisions=around, clearance=clearance), calls)
+    seconds = min(each)
     kept = motion.margins
     distance = "-" if around is None else f"{kept.distance:.3f}"
     return (
@@ -66,9 +62,9 @@ def row(name: str, chart: oc.Chart, path: Array, xi: str, around: Collisions | N
 def reach_row(name: str, chart: oc.Chart, calls: int) -> str:
     """Ranges and self-motion from the centre of the domain."""
     q = chart.problem.domain.centre
-    alone, _ = _best(lambda: chart.xi_range(q), calls)
-    whole, motion = _best(lambda: chart.self_motion(q), calls)
-    return f"| {name} | {1e3 * alone:.0f} | {1e3 * whole:.0f} | {len(motion.q)} |"
+    alone, _ = timed(lambda: chart.xi_range(q), calls)
+    whole, motion = timed(lambda: chart.self_motion(q), calls)
+    return f"| {name} | {1e3 * min(alone):.0f} | {1e3 * min(whole):.0f} | {len(motion.q)} |"
 
 
 def main(quick: bool = False) -> list[str]:
@@ -87,16 +83,6 @@ def main(quick: bool = False) -> list[str]:
     print("\n| chart | xi_range [ms] | self_motion [ms] | points |\n| --- | --- | --- | --- |")
     print("\n".join(reach))
     return rows + reach
-
-
-def _best(work: Callable[[], T], calls: int) -> tuple[float, T]:
-    """Least seconds of some calls, and a result."""
-    seconds = []
-    for _ in range(calls):
-        start = time.perf_counter()
-        result = work()
-        seconds.append(time.perf_counter() - start)
-    return min(seconds), result
 
 
 def _tool_error(chart: oc.Chart, motion: JointMotion) -> float:

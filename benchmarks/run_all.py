@@ -56,6 +56,8 @@ SCRIPTS = (
     "beyond_reach",
     "collisions",
     "arm",
+    "all_solutions",
+    "arm_batches",
     "default_gains",
     "safety",
     "faults",

@@ -17,6 +17,7 @@ from orthocas.solvers.protocol import (
     SolveResult,
     Status,
 )
+from orthocas.tools.blas_graph import DenseNode
 from orthocas.tools.cached import building
 from orthocas.tools.checks import Array, require_at_least, require_count
 from orthocas.tools.interrupts import check, deferred
@@ -348,7 +349,7 @@ class _Flow:
         return change
 
 
-class ArrayNode(ca.Callback):
+class ArrayNode(DenseNode):
     """A function of columns whose outputs are computed in NumPy.
 
     Exceptions, Ctrl-C included, cannot pass through the code of the solver. The node keeps an exception in `error` and
@@ -372,31 +373,9 @@ class ArrayNode(ca.Callback):
         jacobian: "ArrayNode | None" = None,
         forward: "ArrayNode | None" = None,
     ) -> None:
-        ca.Callback.__init__(self)
-        self._rows, self._shapes, self._compute, self._jacobian = tuple(rows), tuple(shapes), compute, jacobian
-        self._forward = forward
+        self._rows, self._compute, self._jacobian, self._forward = tuple(rows), compute, jacobian, forward
         self.error: BaseException | None = None
-        self.construct(name, {})
-
-    def get_n_in(self) -> int:
-        """Number of input columns."""
-        return len(self._rows)
-
-    def get_n_out(self) -> int:
-        """Number of outputs."""
-        return len(self._shapes)
-
-    def get_sparsity_in(self, i: int) -> ca.Sparsity:
-        """Dense columns."""
-        return ca.Sparsity.dense(self._rows[i], 1)
-
-    def get_sparsity_out(self, i: int) -> ca.Sparsity:
-        """Dense."""
-        return ca.Sparsity.dense(*self._shapes[i])
-
-    def has_eval_buffer(self) -> bool:
-        """Whether to use buffers; they avoid a second copy."""
-        return True
+        DenseNode.__init__(self, name, [(count, 1) for count in rows], shapes)
 
     def eval_buffer(self, arg: Sequence[Any], res: Sequence[Any]) -> int:
         """Evaluate the outputs; the return value 1 means to CasADi that the evaluation failed."""
@@ -430,7 +409,7 @@ class ArrayNode(ca.Callback):
         if self._jacobian is None:
             raise NotImplementedError(name)
         inputs = [ca.MX.sym("x", rows) for rows in self._rows]
-        unused = ca.MX.sym("y", *self._shapes[0])
+        unused = ca.MX.sym("y", *self._outputs[0])
         return ca.Function(name, [*inputs, unused], [self._jacobian(*inputs)], list(inames), list(onames), dict(opts))
 
     def has_forward(self, nfwd: int) -> bool:
@@ -453,7 +432,7 @@ class ArrayNode(ca.Callback):
 
     def get_jac_sparsity(self, oind: int, iind: int, symmetric: bool) -> ca.Sparsity:
         """An empty pattern, because a Krylov method uses only products with the Jacobian."""
-        return ca.Sparsity(self._shapes[oind][0], self._rows[iind])
+        return ca.Sparsity(self._outputs[oind][0], self._rows[iind])
 
     def reraise(self) -> None:
         """Raise the exception that stopped an evaluation, if any."""

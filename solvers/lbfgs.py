@@ -76,10 +76,10 @@ class LBFGS:
 class QuasiNewton(LBFGS):
     """L-BFGS in variables z in which a Gauss-Newton matrix H, estimated from few samples and damped, is the identity.
 
-    theta = theta_k + L^-T z with L L^T = H(theta_k) + 0.003 diag H; of many coefficients, H has only its diagonal
-    blocks. A matrix of K coefficients and N samples takes
-    N K^2 operations, a gradient N K. So one matrix and many gradients cost less than a few Gauss-Newton steps, and
-    L-BFGS learns what the matrix misses. It starts again, with a new matrix, once the loss has fallen enough.
+    theta = theta_k + L^-T z with L L^T = H(theta_k) + 0.003 diag H. With many coefficients, only the diagonal blocks of
+    H are used. A matrix of K coefficients and N samples takes N K^2 operations, a gradient N K. So one matrix and many
+    gradients cost less than a few Gauss-Newton steps, and L-BFGS learns what the matrix misses. It starts again, with a
+    new matrix, once the loss has fallen enough.
 
     Args:
         max_iterations: largest number of iterations.

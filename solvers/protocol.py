@@ -80,7 +80,7 @@ class SampledObjective(Objective, Protocol):
     """A mean over samples that can draw fresh ones."""
 
     def batches(self, size: int, count: int, seed: tuple[int, ...]) -> Iterator[Objective]:
-        """The same mean over `count` fresh sample sets, of at most `size` samples each."""
+        """`count` objectives with the same mean over fresh samples, at most `size` each."""
         ...
 
 

@@ -50,8 +50,8 @@ motion_kernel._FLAGS = (*STRICT, "-O1")
 
 
 def _search_briefly(value: point_quality.Value, domain: oc.Domain, seed: int = 0) -> Array:
-    """As users' search for the fastest and slowest mode of a law, from a sixth of the candidates."""
-    fewer = replace(point_quality.WORST, candidates=1000, descents=50, kept=10)
+    """As users' search for the fastest and slowest mode of a law, from a twentieth of the candidates."""
+    fewer = replace(point_quality.WORST, candidates=300, descents=12, kept=4, more_steps=80)
     with patch.object(point_quality, "WORST", fewer):
         return point_quality.least_in_domain(value, domain, seed)
 
@@ -122,6 +122,12 @@ def arm(name: str) -> tuple[pin.Model, str]:
     file, tip = ROBOTS[name]
     full = urdf.read_urdf(robot_data(file))[0]
     return full if "both arms" in name else pinocchio_model.lock_off_chain(full, tip), tip
+
+
+def robot_of(name: str) -> oc.Robot:
+    """The robot of one of ROBOTS."""
+    file, tip = ROBOTS[name]
+    return oc.Robot.from_urdf(robot_data(file), tip)
 
 
 def pinocchio_position(model: pin.Model, q: np.ndarray) -> np.ndarray:

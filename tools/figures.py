@@ -404,7 +404,8 @@ def find_missing(record: Record) -> str:
     for name in dict.fromkeys(_list_imports(text)):
         if name == "browser" and imported("benchmarks/browser.py").PROGRAM is None:
             return "it needs the browser chromium (apt install chromium)"
-        if not (folder / f"{name}.py").exists() and importlib.util.find_spec(name) is None:
+        own = (folder / f"{name}.py").exists() or (folder / name).is_dir()
+        if not own and importlib.util.find_spec(name) is None:
             return f"it needs the package {name} (pip install -e '.[bench,peers,dask]')"
     return ""
 

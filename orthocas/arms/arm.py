@@ -2,12 +2,10 @@
 
 from __future__ import annotations
 
-import math
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from importlib.resources import as_file, files
-from itertools import product
 from pathlib import Path
 from typing import Any, Self
 
@@ -69,13 +67,7 @@ def list_arms() -> tuple[str, ...]:
 class ArmRules:
     """Numbers of an arm's answers."""
 
-    spacing: float = 0.05  #: [rad] or [m] between postures of an arc among which those with an xi are sought
-    steps: int = 40  #: of a search for an xi between two postures
-    met: float = 1e-11  #: error of xi that ends it
-    narrow: float = 1e-14  #: [rad] or [m] between the postures that ends it
-    tolerance: float = 1e-9  #: error of xi of a posture that has it
-    same: float = 1e-6  #: [rad] or [m] between postures that are the same
-    rows: int = 8  #: that a thread takes at once
+    spacing: float = 0.05  #: [rad] or [m] between postures of an arc among which free ones are sought, or a branch's
     postures: int = 100_000  #: of a chart, in generated C
 
 
@@ -100,7 +92,7 @@ class Postures(Shown):
         return self.status == InverseStatus.FOUND
 
     def facts(self) -> dict[str, str]:
-        """How many rows ended how."""
+        """Number of rows with each status."""
         values = np.atleast_1d(self.status)
         counts = {status.name: int((values == status).sum()) for status in InverseStatus}
         names = [self.branch] if isinstance(self.branch, str) else sorted(set(self.branch))
@@ -385,16 +377,15 @@ class Arm(Shown):
         value = as_number("xi", xi)
         if not np.isfinite(value):
             raise InvalidValueError("xi", value, "a finite number")
-        motions = self.self_motion(x)
-        chosen = [(k, name) for k, name in enumerate(self.branch_names) if branch in (ANY, name)]
-        found = [(q, name) for k, name in chosen for q in self._find_xi(motions, k, value)]
-        q = np.array([q for q, _ in found]).reshape(-1, self.robot.n)
+        chosen = [k for k, name in enumerate(self.branch_names) if branch in (ANY, name)]
+        q, owners = self.chart_kernel.solve_all(self._read_one(x), value, None, chosen)
         status = np.full(len(q), int(InverseStatus.FOUND))
         if collisions is not None and len(q):
             status[~collisions.check_free(q)] = InverseStatus.COLLIDING
         away = np.zeros(len(q)) if start is None else np.linalg.norm(q - as_point("start", start, self.robot.n), axis=1)
-        order = np.lexsort((away, status))
-        return Postures(q[order], status[order], tuple(found[k][1] for k in order), np.full(len(q), value))
+        order = np.lexsort((owners, away, status))
+        names = tuple(self.branch_names[k] for k in owners[order])
+        return Postures(q[order], status[order], names, np.full(len(q), value))
 
     def tracker(
         self,
@@ -571,23 +562,20 @@ class Arm(Shown):
         self, targets: Array, starts: Array | None, chosen: Sequence[int], anywhere: bool
     ) -> tuple[Array, Indices]:
         """Postures of targets (N, k) on their arcs, nearest to starts or far from limits, and how they ended."""
-        q = np.full((len(targets), self.robot.n), np.nan)
-        status = np.full(len(targets), int(InverseStatus.NOT_FOUND))
-        domains = [self.charts[k].problem.domain for k in chosen]
+        if anywhere:
+            q = self.maps.choose_postures(targets, starts)
+        else:
+            q = np.full((len(targets), self.robot.n), np.nan)
+            domains = [self.charts[k].problem.domain for k in chosen]
 
-        def solve_row(row: int) -> None:
-            start = None if starts is None else starts[row]
-            motions = find_motions(self.maps, targets[row], *(() if start is None else (start[None],)))
-            if not motions.components:
-                return
-            if anywhere:
-                q[row] = (motions.best(self._measure_room) if start is None else motions.nearest(start)).q
-            else:
-                q[row] = self._choose_inside(motions, domains, start)
-            status[row] = InverseStatus.FOUND if np.isfinite(q[row, 0]) else InverseStatus.NOT_FOUND
+            def solve_row(row: int) -> None:
+                start = None if starts is None else starts[row]
+                motions = find_motions(self.maps, targets[row], *(() if start is None else (start[None],)))
+                if motions.components:
+                    q[row] = self._choose_inside(motions, domains, start)
 
-        run_in_threads(solve_row, range(len(targets)))
-        return q, status
+            run_in_threads(solve_row, range(len(targets)))
+        return q, np.where(np.isfinite(q[:, 0]), int(InverseStatus.FOUND), int(InverseStatus.NOT_FOUND))
 
     def _choose_inside(self, motions: SelfMotions, domains: Sequence[Domain], start: Array | None) -> Array:
         """A posture in one of the domains, of those 0.05 rad apart on the arcs; NaN where there is none."""
@@ -613,16 +601,16 @@ class Arm(Shown):
         collisions: Collisions,
     ) -> tuple[Array, InverseStatus] | None:
         """A posture of one target without a contact, of those with xi or of many on its arcs; None if there is none."""
-        motions = find_motions(self.maps, target, *(() if start is None else (start[None],)))
         # With xi: those that have it exactly, and are free.
         if xi is not None:
-            exact = np.array([q for k in chosen for q in self._find_xi(motions, k, xi)]).reshape(-1, self.robot.n)
+            exact = self.chart_kernel.solve_all(target, xi, start, chosen)[0]
             exact = exact[collisions.check_free(exact)] if len(exact) else exact
             if len(exact):
                 return exact[
                     0 if start is None else np.linalg.norm(exact - start, axis=1).argmin()
                 ], InverseStatus.FOUND
         # Otherwise, of free postures on the arcs ...
+        motions = find_motions(self.maps, target, *(() if start is None else (start[None],)))
         q = np.vstack([np.empty((0, self.robot.n)), *(arc.at(self._list_places(arc)) for arc in motions)])
         q = q[collisions.check_free(q)] if len(q) else q
         owners = np.zeros(len(q), dtype=np.int64)
@@ -657,57 +645,6 @@ class Arm(Shown):
         room = np.minimum(q - low, high - q)[:, bounded] / (high - low)[bounded]
         return np.asarray(2 * room.min(axis=1, initial=1.0))
 
-    def _find_xi(self, motions: SelfMotions, k: int, xi: float) -> list[Array]:
-        """Postures on the arcs where chart k has an xi."""
-        chart = self.charts[k]
-        domain, (low, high) = chart.problem.domain, chart.problem.domain.bounds
-        period = float(chart.parts.turns[chart.m])
-        found: list[Array] = []
-
-        def miss(q: Array) -> Array:
-            left = chart.xi(q)[:, 0] - xi
-            return np.asarray(left - period * np.round(left / period) if period else left)
-
-        # Joints without limits may need full turns: into the box of the domain, or where turns change xi.
-        endless, winds = np.isinf(self.robot.lower) & self.maps.turning, chart.parts.boxed.winding
-        low, high = (np.where(winds, domain.home + k * 3 * np.pi, end) for k, end in ((-1, low), (1, high)))
-        counts, periods = endless & np.isfinite(low), np.where(endless, 2 * np.pi, 0.0)
-        for arc in motions:
-            # xi at even places of the arc, where the domain may hold them.
-            places = self._list_places(arc)
-            along = arc.at(places)
-            first = np.where(counts, np.ceil((low - along.max(axis=0)) / (2 * np.pi)), 0.0)
-            last = np.where(counts, np.floor((high - along.min(axis=0)) / (2 * np.pi)), 0.0)
-            for turns in product(*map(np.arange, first, last + 1)):
-                shift: Array = 2 * np.pi * np.array(turns, dtype=float)
-                q = along + shift
-                near = np.flatnonzero(((q >= low - RULES.spacing) & (q <= high + RULES.spacing)).all(axis=1))
-                left = np.full(len(q), np.nan)
-                if near.size:
-                    left[near] = miss(q[near])
-                # At an end of an arc, rounding must not decide on which side of xi it lies.
-                left[np.abs(left) < RULES.met] = 0.0
-                # A change of sign between two places has a posture with this xi, unless xi jumps by its period there.
-                # Only that posture need lie in the domain, of which the arc may pass a short part.
-                crosses = left[:-1] * left[1:] <= 0
-                if period:
-                    crosses &= np.abs(left[1:] - left[:-1]) < period / 2
-                pairs = [places[row : row + 2].tolist() for row in np.flatnonzero(crosses)]
-                # Where xi turns back between two places, there may be one on both sides of the turn.
-                ahead, size = np.abs(np.diff(left)), np.abs(left)
-                dips = (left[:-2] * left[1:-1] > 0) & (left[2:] * left[1:-1] > 0) & (size[1:-1] <= size[:-2])
-                dips &= (size[1:-1] <= size[2:]) & (size[1:-1] <= np.maximum(ahead[:-1], ahead[1:]))
-                for row in np.flatnonzero(dips):
-                    begin, end = places[row], places[row + 2]
-                    turn = _find_turn(arc, shift, miss, begin, end, float(np.sign(left[row])))
-                    pairs += [] if turn is None else [[begin, turn], [turn, end]]
-                for begin, end in pairs:
-                    posture, error = _find_root(arc, shift, miss, begin, end)
-                    known = any(np.abs(wrap_shortest(posture - other, periods)).max() < RULES.same for other in found)
-                    if abs(error) < RULES.tolerance and not known and bool(domain.contains(posture)):
-                        found.append(posture)
-        return found
-
     def _list_places(self, arc: Arc) -> Array:
         """Places on an arc, at most `RULES.spacing` apart, (P,)."""
         return np.linspace(0.0, arc.length, max(2, int(arc.length / RULES.spacing) + 2))
@@ -734,42 +671,3 @@ def _agree(chart: Chart, task: Task) -> bool:
     q = chart.problem.domain.home[None]
     same = chart.m == task.m and chart.n == task.robot.n
     return same and bool(np.allclose(chart.problem.task.batched(q)[0], task.batched(q)[0], rtol=0, atol=1e-9))
-
-
-def _find_turn(
-    arc: Arc, shift: Array, f: Callable[[Array], Array], low: float, high: float, sign: float
-) -> float | None:
-    """A place between two on an arc, shifted, where f has another sign than at both; None if there is none."""
-    ratio = (math.sqrt(5) - 1) / 2
-    for _ in range(RULES.steps):
-        pair = high - ratio * (high - low), low + ratio * (high - low)
-        first, second = (sign * f(arc.at(np.array(pair)) + shift)).tolist()
-        if min(first, second) < 0:
-            return pair[0] if first < second else pair[1]
-        low, high = (low, pair[1]) if first < second else (pair[0], high)
-        # What is left no longer falls.
-        if abs(first - second) < RULES.met:
-            break
-    return None
-
-
-def _find_root(arc: Arc, shift: Array, f: Callable[[Array], Array], low: float, high: float) -> tuple[Array, float]:
-    """The posture on an arc, shifted, between places where f has different signs, at which f is 0; and f there.
-
-    By regula falsi, with every third step a bisection.
-    """
-    # The end with the smaller value is the answer where no step is better.
-    values = [float(f((arc.at(place) + shift)[None])[0]) for place in (low, high)]
-    q, value = arc.at(low if abs(values[0]) <= abs(values[1]) else high) + shift, min(values, key=abs)
-    for k in range(RULES.steps):
-        if abs(value) < RULES.met or high - low < RULES.narrow:
-            break
-        place = low + (high - low) * (values[0] / (values[0] - values[1]) if k % 3 < 2 else 0.5)
-        q = arc.at(place) + shift
-        value = float(f(q[None])[0])
-        # The root stays between both ends.
-        if (value > 0) == (values[0] > 0):
-            low, values[0] = place, value
-        else:
-            high, values[1] = place, value
-    return q, value

@@ -75,6 +75,8 @@ class ChartKernelRules:
     near_starts: int = 6  #: stored postures of a chart that a row tries before all curves of x are searched
     spacing: float = 0.05  #: between points of curves at which xi is looked at
     room: float = 0.05  #: beyond limits, within which a point between nodes may be inside
+    same: float = 1e-6  #: [rad] or [m] between postures that are the same
+    every: int = 1000  #: postures with x and xi, at most
     lifts: int = 4096  #: combinations of full turns of joints, at most
     bisections: int = 30  #: between two of these points, at most
     halved: int = 3  #: of them, before Newton's method is tried
@@ -201,6 +203,19 @@ class ChartKernel:
         else:
             run_in_threads(solve_piece, range(0, count, RULES.piece))
         return q, status.astype(np.int64), owner.astype(np.int64)
+
+    def solve_all(self, target: Array, xi: float, start: Array | None, allowed: Sequence[int]) -> tuple[Array, Indices]:
+        """All postures (N, n) of a target (k,) and xi on its curves, and their charts; a start leads to curves, too."""
+        flags, n = np.zeros(len(self.charts), dtype=np.int8), self.maps.robot.n
+        flags[list(allowed)] = 1
+        room = np.empty(CURVES.nodes * (2 * n + 1) + (len(self.maps.stored.q) + 1) // 2)
+        q, owner = np.empty((RULES.every, n)), np.empty(RULES.every, dtype=np.intc)
+        count = self._c.solve_all(
+            *(pointer(target), ctypes.c_double(xi), None if start is None else pointer(np.ascontiguousarray(start))),
+            *(pointer(flags), ctypes.byref(self._range), CURVES.patience, pointer(room), CURVES.nodes),
+            *(pointer(q), pointer(owner), RULES.every),
+        )
+        return q[:count], owner[:count].astype(np.int64)
 
     def build_targets(self, vectors: Array) -> Array:
         """As `TargetReader.build`, of contiguous vectors (N, m)."""

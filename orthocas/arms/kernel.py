@@ -14,7 +14,7 @@ from orthocas.native.kernels import generate_kernels
 from orthocas.native.libraries import keep_library, load_library, pointer
 from orthocas.native.rendering import get_source, render
 from orthocas.tasks.task import Frames, Task
-from orthocas.tools.batch import dense_function
+from orthocas.tools.batch import dense_function, run_in_threads
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array
 
@@ -51,7 +51,7 @@ class Curve:
 def evaluate_cubic(
     a: Array, b: Array, start: Array, end: Array, h: Array | float, u: Array | float
 ) -> tuple[Array, Array]:
-    """Points at shares u of cubic curves of length h from a to b with unit tangents, and unit directions there."""
+    """Points at fractions u of cubic curves of length h from a to b with unit tangents, and unit directions there."""
     d = b - a
     q = a + (3 * u * u - 2 * u**3) * d + h * ((u - 2 * u * u + u**3) * start + (u**3 - u * u) * end)
     slope = 6 * (u - u * u) * d + h * ((1 - 4 * u + 3 * u * u) * start + (3 * u * u - 2 * u) * end)
@@ -111,6 +111,35 @@ class CurveKernel:
         )
         return stored.q[chosen[:total]]
 
+    def choose_postures(self, targets: Array, starts: Array | None, stored: StoredPostures, places: Array) -> Array:
+        """Postures (N, n) within the limits of targets (N, k), nearest to starts (N, n), or farthest from the limits.
+
+        They are the best ones on all curves that stored postures and starts lead to; NaN where there is none.
+        """
+        count, n, branches = len(targets), len(self.lower), len(stored.begins) - 1
+        q, most = np.empty((count, n)), RULES.starts + branches
+        inputs = np.ascontiguousarray(targets), np.ascontiguousarray(places, dtype=np.float32)
+        first = None if starts is None else np.ascontiguousarray(starts)
+        known = [pointer(part) for part in (stored.q, stored.places, stored.weights, stored.begins)]
+
+        def choose_piece(begin: int) -> None:
+            rows = slice(begin, begin + RULES.piece)
+            # Memory of C, which costs nothing where it is not used.
+            memory = (
+                *(np.empty((RULES.nodes, 2 * n + 1)), np.empty(RULES.crossings, crossing_type(n))),
+                *(np.empty((RULES.samples, 2 * n + 2)), np.empty(len(stored.q), dtype=np.float32)),
+                *(np.empty(most, dtype=np.intc), np.empty((most + 1, n))),
+            )
+            own = [pointer(part[rows]) for part in inputs]
+            self._c.choose_rows(
+                *(len(q[rows]), own[0], targets.shape[1], own[1], None if first is None else pointer(first[rows])),
+                *(*known, branches, len(stored.places), len(stored.q), RULES.patience),
+                *(*map(pointer, memory), pointer(q[rows])),
+            )
+
+        run_in_threads(choose_piece, range(0, count, RULES.piece))
+        return q
+
     def correct(self, target: Array, q: Array, tangent: Array) -> NDArray[np.bool_]:
         """Bring points q (K, n) to their curve across tangents (K, n), both in place; where that succeeds, (K,)."""
         good = np.empty(len(q), dtype=np.bool_)
@@ -136,7 +165,7 @@ def write_curves(equations: ca.Function, lower: Array, upper: Array, turning: ND
         "high": upper,
         "turning": turning,
     }
-    included = {name: get_source(name) for name in ("self_motion.c", "curve_math.c")}
+    included = {name: get_source(name) for name in ("self_motion.c", "curve_math.c", "arc_postures.c")}
     return {"task_curves.c": render("task_curves.c", values), **included}
 
 

@@ -121,6 +121,10 @@ class ArmMaps:
         near = self.kernel.choose_starts(self.stored, self.places.of_targets(target))
         return self.kernel.find_curves(target, np.ascontiguousarray(np.vstack([*starts, near])))
 
+    def choose_postures(self, targets: Array, starts: Array | None) -> Array:
+        """Postures (N, n) of targets (N, k), as of the kernel."""
+        return self.kernel.choose_postures(targets, starts, self.stored, self.places.of_targets(targets))
+
     def evaluate(self, q: Array, targets: Array) -> tuple[Array, Array]:
         """Errors e (N, m) and rates J (N, m, n) of postures (N, n) and targets (N, k)."""
         e, J = self._batched_equations(q, targets)

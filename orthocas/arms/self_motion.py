@@ -133,17 +133,20 @@ class Arc(Shown):
         """
         s = as_float_array("place", place)
         places = np.clip(np.nan_to_num(s.reshape(-1)), 0.0, self.length)
-        q, tangent = self._guess(places)
-        ends = np.concatenate([self._nodes[0][:1], self._nodes[0][-1:]])
-        self.maps.kernel.correct(self.target, q, tangent)
-        if not self.closed:
-            q[places <= 0.0], q[places >= self.length] = ends[0], ends[1]
-        q = np.clip(q, self.maps.robot.lower, self.maps.robot.upper)
+        q = self._stand(places)[0]
         return np.asarray(q.reshape(*s.shape, q.shape[1]))
 
     def direction(self, place: float) -> Array:
-        """The direction of the arc (n,) at a length from its begin, to about 1e-3."""
-        return np.asarray(self._guess(np.array([min(max(place, 0.0), self.length)]))[1][0])
+        """The direction of the arc (n,) at a length from its begin."""
+        return np.asarray(self._stand(np.array([min(max(place, 0.0), self.length)]))[1][0])
+
+    def _stand(self, places: Array) -> tuple[Array, Array]:
+        """Postures (P, n) at places from end to end, and directions there."""
+        q, t = self._guess(places)
+        self.maps.kernel.correct(self.target, q, t)
+        if not self.closed:
+            q[places <= 0.0], q[places >= self.length] = self._nodes[0][0], self._nodes[0][-1]
+        return np.clip(q, self.maps.robot.lower, self.maps.robot.upper), t
 
     def sample(self, n: int, metric: Metric | MetricSpec = "euclidean") -> Array:
         """Postures at equal distances along the arc, (n, joints), both ends among them; of a closed arc only one.
@@ -472,7 +475,7 @@ class SelfMotions(Shown):
         arc = self.components[k]
         best, before, slope = Place(wish, np.inf, k, place), (0.0, 0.0), 1.0
         for number in range(RULES.refinements):
-            q, t = arc.at(place), arc.direction(place)
+            q, t = (part[0] for part in arc._stand(np.array([place])))
             away = self.measure_away(q[None], wish)[0]
             gap, pull = float(np.linalg.norm(away)), float(away @ t)
             # Where the way to the posture is at right angles to the arc, the distance is least.

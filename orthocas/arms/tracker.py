@@ -168,10 +168,9 @@ class ArmTracker(Shown):
 
         Args:
             x: one task value.
-            xi: wished value in the tracker's chart, a number, or (r,); None holds the last one, at first that of the
-                begin.
-            posture: to stay near to instead of holding xi, (n,): of the postures with x, the one at which
-                |q - posture|, with weights, is least. It counts until xi or another posture is given.
+            xi: target in the tracker's chart, a number or (r,). Default: the last target, at first xi at the start.
+            posture: (n,), a target in place of xi: among the postures with x, the tracker goes to the one with the
+                least weighted distance |q - posture|. It holds until xi or another posture is given.
 
         Raises:
             InvalidValueError: if x is no task value of this task, or xi and a posture are given.

@@ -232,7 +232,7 @@ Cyclic = tuple[str, ...] | Literal["auto"]  #: names of joints; "auto" for all c
 
 
 def check_cyclic(value: Any) -> Cyclic:
-    """The value as names, or "auto".
+    """Return the joint names that were given, or "auto".
 
     Raises:
         InvalidValueError: if it is neither, or a name appears twice.
@@ -249,7 +249,7 @@ def check_without(names: Any, cyclic: Cyclic) -> tuple[str, ...]:
     """Names of joints that coordinates do not depend on.
 
     Raises:
-        InvalidValueError: if they are no different names, or one is cyclic, too.
+        InvalidValueError: if a name appears twice, or one is also cyclic.
     """
     known = isinstance(names, list | tuple) and all(isinstance(name, str) for name in names)
     if not known or len(set(names)) != len(names) or (cyclic != "auto" and set(names) & set(cyclic)):

@@ -425,10 +425,8 @@ def _report_search(monitor: Monitor, stage: str, *, guarded: bool = False) -> Lo
 
 
 def _check_parts(check: BoxCheck, parts: Subdivision, mapped: Mapped, monitor: Monitor) -> list[BoxResults]:
-    # In pieces, whose results come in order.
-    # Leaves of the tree that count as proved, in pieces for the workers.
+    # Leaves of the tree that count as proved, in pieces for the workers; results come in order.
     low, high = parts.leaves(PROVED)
-    # pieces of boxes, on many machines if there is an executor
     pieces = [slice(k, k + RULES.at_once) for k in range(0, len(low), RULES.at_once)]
     results = []
     try:

@@ -105,7 +105,7 @@ class ChartRows:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class GraphRows:
-    """A matrix of so many rows that a graph gives column by column."""
+    """A matrix whose entries a graph computes, column by column."""
 
     graph: TaylorGraph
     rows: int
@@ -241,7 +241,7 @@ def _build_coordinate_rows(coordinates: Coordinates) -> tuple[CoordinateRows | N
 
 @dataclass(frozen=True)
 class TipRows:
-    """What a task compares of the tip, so that x(q) = x(p) if and only if these agree at q and p."""
+    """The parts of the tip's pose that a task fixes: x(q) = x(p) if and only if they are equal at q and p."""
 
     position: tuple[int, ...] = ()  #: axes of the world along which the position counts
     rotation: bool = False  #: the whole orientation

@@ -1,5 +1,6 @@
 """The self-motion curves of many task values at once, r = 1, and the points on them whose xi is nearest."""
 
+from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import product
 
@@ -8,6 +9,7 @@ from numpy.typing import NDArray
 
 from orthocas.charts.curve_tracer import RULES, CurveTracer, Traces, solutions_of
 from orthocas.charts.descent import BoxedPhi
+from orthocas.charts.motion_kernel import SearchKernel, has_library
 from orthocas.charts.phi import largest
 from orthocas.charts.search import Starts
 from orthocas.tools.cached import cached_property
@@ -31,7 +33,7 @@ class Nearest:
         return cls(starts.copy(), np.full(len(starts), np.inf), np.zeros(len(starts), dtype=bool))
 
     def take(self, rows: Indices, q: Array, distance: Array, between: bool = False) -> None:
-        """Take over points (M, n) that are nearer than those of their rows (M,), which may occur several times."""
+        """Keep those points (M, n) that are nearer than the best so far of their rows (M,); a row may occur twice."""
         # what is written last stays
         farthest_first = np.argsort(-distance, kind="stable")
         better = farthest_first[distance[farthest_first] < self.distance[rows[farthest_first]]]
@@ -56,9 +58,14 @@ class SelfMotionCurves:
     boxed: BoxedPhi
     starts: Starts
     tracer: CurveTracer
+    kernel: SearchKernel  #: does the same in C, where it can be compiled
 
     def search(self, targets: Array, own: Array, tolerance: float) -> Nearest:
         """The nearest points for targets (N, n) of phi, from stored starts and one of the caller's (N, n)."""
+        if len(own) and self.has_kernel:
+            first, more = self.stages(targets, own)
+            starts = np.concatenate([first, more]).transpose(1, 0, 2)
+            return Nearest(*self.kernel.search(targets, starts, len(first), tolerance))
         pieces = [slice(first, first + _AT_ONCE) for first in range(0, len(own), _AT_ONCE)]
         found = [self._search(targets[rows], own[rows], tolerance) for rows in pieces]
         parts = zip(*(vars(part).values() for part in (Nearest.empty(own[:0]), *found)), strict=True)
@@ -69,16 +76,10 @@ class SelfMotionCurves:
 
         Curves are sought from positions (S, n) near solutions as well.
         """
-        targets, own = target[None], self.boxed.domain.home[None]
+        targets, own, found = target[None], self.boxed.domain.home[None], [np.empty((0, len(target)))]
+        starts = np.concatenate([near[:, None], *self.stages(targets, own)])
         with np.errstate(all="ignore"):
-            q, known = self._reach(targets, np.concatenate([near[:, None], *self.stages(targets, own)]))
-            away, found = self.tracer.away(q)[0], [np.empty((0, len(target)))]
-            while not known.all():
-                # the next curve, through the start nearest to the domain that lies on none so far
-                start = np.argmin(np.where(known[0], np.inf, away))
-                traces = self.tracer.trace(targets[:, : self.boxed.m], q[:, start], np.zeros(1, dtype=np.int64))
-                known[0, start] = True
-                known |= self.tracer.on_curves(q, traces)
+            for traces in self._trace_all(targets, starts):
                 # xi - xi(q) at points close to one another
                 points = self._steps(traces, own).divided()[0]
                 flat = points.reshape(-1, len(target))
@@ -92,6 +93,23 @@ class SelfMotionCurves:
                 guess = points[close]
                 found.append(self._solve(targets, np.zeros(len(guess), dtype=np.int64), guess, tolerance)[0])
         return np.concatenate(found)
+
+    def _trace_all(self, targets: Array, starts: Array) -> Iterator[Traces]:
+        """The curves of one target (1, n) to which starts (S, 1, n) lead, one after the other."""
+        row = np.zeros(1, dtype=np.int64)
+        if self.has_kernel:
+            for q, t in self.kernel.trace(targets[0], starts[:, 0]):
+                yield Traces(row, q[None], t[None], np.array([len(q)]))
+            return
+        q, known = self._reach(targets, starts)
+        away = self.tracer.away(q)[0]
+        while not known.all():
+            # the next curve, through the start nearest to the domain that lies on none so far
+            start = np.argmin(np.where(known[0], np.inf, away))
+            traces = self.tracer.trace(targets[:, : self.boxed.m], q[:, start], row)
+            known[0, start] = True
+            known |= self.tracer.on_curves(q, traces)
+            yield traces
 
     def _search(self, targets: Array, own: Array, tolerance: float) -> Nearest:
         best, ends, traced = Nearest.empty(own), Ends.empty(own.shape[1]), list[Traces]()
@@ -420,6 +438,11 @@ class SelfMotionCurves:
     def _xi_left(self, targets: Array, q: Array) -> Array:
         """xi - xi(q), (N,)."""
         return self.boxed.xi_gaps(targets, q)[:, 0]
+
+    @cached_property
+    def has_kernel(self) -> bool:
+        """Whether there is a C compiler; it runs once for a chart."""
+        return has_library(self.kernel)
 
     @cached_property
     def _period(self) -> float:

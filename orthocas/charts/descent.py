@@ -308,7 +308,7 @@ class BoxedPhi:
         return found
 
     def room_slopes(self, u: Array) -> Array:
-        """How that changes with u, (N, k, n)."""
+        """Derivatives of `room` by u, (N, k, n)."""
         found: Array = self._rooms[1](self.points(u))[0].reshape(len(u), -1, len(self.low))
         return found * self.domain.half_width
 

@@ -365,7 +365,7 @@ class PointSolver:
         return all(after < before or after <= NEWTON.goal for before, after in pairwise(errors))
 
     def shorten(self) -> bool:
-        """Halve the steps with a fresh J until they reduce the error; whether they do. The next J gives whole ones."""
+        """Halve the steps, with a fresh J, until they reduce the error; return whether they do."""
         for _ in range(NEWTON.halvings):
             self._H *= 0.5
             if self.step():

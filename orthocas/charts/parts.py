@@ -15,7 +15,7 @@ from orthocas.charts.curves import SelfMotionCurves
 from orthocas.charts.descent import RULES, BoxedPhi
 from orthocas.charts.inside import Inside
 from orthocas.charts.inverse import Inverse
-from orthocas.charts.motion_kernel import MotionKernel, find_kernel
+from orthocas.charts.motion_kernel import MotionKernel, SearchKernel, has_library
 from orthocas.charts.newton import (
     NEWTON,
     Continuation,
@@ -175,7 +175,8 @@ class ChartParts:
     @cached_property
     def motion_kernel(self) -> MotionKernel | None:
         """Follows self-motions in C, r = 1; None where Python does."""
-        return find_kernel(self.chart)
+        kernel = MotionKernel(self.chart)
+        return kernel if has_library(kernel) else None
 
     @cached_property
     def turn_shifts(self) -> dict[str, Array]:
@@ -206,7 +207,7 @@ class ChartParts:
             FewRows(phi_map, self.point_functions, Newton(phi_map, k)) for k in (NEWTON.halvings, NEWTON.brief)
         )
         in_domain, inside = InDomain(boxed, starts), Inside(boxed, starts)
-        curves = SelfMotionCurves(boxed, starts, self.tracer) if chart.r == 1 else None
+        curves = SelfMotionCurves(boxed, starts, self.tracer, SearchKernel(chart)) if chart.r == 1 else None
         return Inverse(chart.problem, phi_map, local, starts, Continuation(phi_map), in_domain, inside, curves, brief)
 
     @cached_property

@@ -144,7 +144,7 @@ class RegularPart(ClearBox):
 
     @property
     def pivots(self) -> ca.Function:
-        """q (n, 1) -> those of the clear box, then v(q) - bound, (m + 1, 1)."""
+        """q (n, 1) -> the pivots of the clear box, then v(q) - bound, (m + 1, 1)."""
         return self._all_pivots
 
     @cached_property

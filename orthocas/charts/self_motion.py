@@ -113,7 +113,8 @@ def _curve(chart: Chart, q: Array, step: float, collisions: Collisions | None) -
     rises = np.sign(np.diff(xi[:, 0]))
     low, high = (down, up) if xi[0, 0] <= xi[-1, 0] else (up, down)
     place = len(down.q) - 1
-    ends = Interval(chart.labels[-1], float(xi[place, 0]), xi.min(), xi.max(), low.stop, high.stop)
+    least, most = (_find_extreme(chart, points, xi[:, 0], sign, up.endless, collisions) for sign in (-1, 1))
+    ends = Interval(chart.labels[-1], float(xi[place, 0]), least, most, low.stop, high.stop)
     return SelfMotionCurve(
         chart.x(q),
         points,
@@ -124,6 +125,23 @@ def _curve(chart: Chart, q: Array, step: float, collisions: Collisions | None) -
         up.endless,
         int(np.count_nonzero(np.diff(rises[rises != 0]))),
     )
+
+
+def _find_extreme(
+    chart: Chart, points: Array, xi: Array, sign: int, closed: bool, collisions: Collisions | None
+) -> float:
+    """The largest xi (sign 1) or the least (-1) on a curve, also between its points (N, n), where xi turns back."""
+    values = sign * xi
+    best = float(values.max())
+    # Beside a point that is no lower than its neighbours; of a closed curve, the last point is the first one.
+    around = np.concatenate([values[-2:-1], values, values[1:2]] if closed else [[np.inf], values, [np.inf]])
+    drops = np.minimum(values - around[:-2], values - around[2:]), np.maximum(values - around[:-2], values - around[2:])
+    for k in np.flatnonzero(drops[0] >= 0).tolist():
+        # A parabola through the three points rises above the middle one by an eighth of the drop at most.
+        if values[k] + drops[1][k] >= best:
+            ahead = counted_on(branch_along(chart, points[k], 0, sign, collisions).xi, chart.parts.turns[chart.m :])
+            best = max(best, float(values[k] + sign * (ahead[-1, 0] - ahead[0, 0])))
+    return sign * best
 
 
 def _set(chart: Chart, q: Array, samples: int, collisions: Collisions | None) -> SelfMotion:

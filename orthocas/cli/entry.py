@@ -24,7 +24,7 @@ def open_closed_streams() -> None:
 def leave_on_ctrl_c() -> None:
     """Let Ctrl-C end the process at once, with one line, until `main` has imported what it needs.
 
-    Nothing is lost meanwhile, and an exception would come out of half-imported libraries as anything.
+    Nothing is lost by that. A KeyboardInterrupt inside half-imported libraries could surface as any other error.
     """
     if signal.getsignal(signal.SIGINT) is signal.default_int_handler:
         signal.signal(signal.SIGINT, _leave)

@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Callable
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -13,14 +12,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.charts.chart import Chart
-from orthocas.charts.curve_tracer import RULES
-from orthocas.charts.curves import Nearest, SelfMotionCurves
 from orthocas.charts.inverse import Inverse, Solutions, build_phi, build_phi_of_wish, solve_rows
-from orthocas.charts.motion_kernel import generate_curve_kernels
+from orthocas.charts.motion_kernel import SearchKernel, has_library
 from orthocas.charts.newton import NEWTON, Attempt, Newton
 from orthocas.codegen.generate import generate_c
-from orthocas.codegen.rendering import get_source, render
-from orthocas.native import rendering
+from orthocas.codegen.rendering import get_source
 from orthocas.native.libraries import keep_library, load_library, pointer
 from orthocas.tools.batch import run_in_threads
 from orthocas.tools.cached import cached_property
@@ -33,9 +29,8 @@ _FLAGS = ("-O3",)
 _ROWS = "inverse_rows.c"
 # Evaluations of phi; few where another search follows.
 _ITERATIONS, _FEW_ITERATIONS = 100, 12
-# Rows that a thread takes at once; those along curves take longer.
-_PIECE, _CURVE_PIECE = 512, 64
-_STARTS = 1 + RULES.near_phi + RULES.near_x + RULES.more
+# Rows that a thread takes at once.
+_PIECE = 512
 
 
 def compile_inverse(chart: Chart, folder: str | Path | None = None) -> CompiledInverse:
@@ -66,45 +61,14 @@ def compile_inverse(chart: Chart, folder: str | Path | None = None) -> CompiledI
         [True, True]
     """
     require_kind("chart", chart, Chart)
-    # the library of the chart, then what takes many rows, then what follows curves
+    # the library of the chart, then what takes many rows; what follows curves is a library of its own
     with open_draft_folder() as drafts:
         generate_c(chart, drafts, name="arm")
         sources = {path.name: path.read_text(encoding="utf-8") for path in sorted(drafts.glob("*.[hc]"))}
     sources[_ROWS] = get_source(_ROWS)
-    curves = chart.parts.inverse.curves
-    if curves is not None:
-        sources |= {"curve_rows.c": get_source("curve_rows.c"), "curve_math.c": rendering.get_source("curve_math.c")}
-        sources["curves.c"] = write_curve_source(chart, curves)
-    return CompiledInverse(chart, keep_library("inverse", sources, (*_FLAGS, f"-DN={chart.n}"), folder))
-
-
-def write_curve_source(chart: Chart, curves: SelfMotionCurves) -> str:
-    """C of the search along self-motion curves: kernels and tables of a chart, then runtime/curve_rows.c.
-
-    Raises:
-        DomainError: if the domain has a condition, but no expression of it.
-    """
-    domain, kernels = chart.problem.domain, generate_curve_kernels(chart)
-    low, high = domain.bounds
-    values = {
-        "kernels": kernels.code,
-        "arrays": kernels.declare_arrays,
-        "call": kernels.write_call,
-        "m": chart.m,
-        "starts": _STARTS,
-        "rules": asdict(RULES),
-        "xi_size": float(chart.parts.phi_sizes[chart.m]),
-        "period": float(chart.parts.turns[chart.m]),
-        "low": low,
-        "high": high,
-        "centre": domain.centre,
-        "half_width": domain.half_width,
-        "turning": curves.tracer.turning,
-        "bounded": np.isfinite(low),
-        "winding": curves.boxed.winding,
-        "pivots": kernels.numbers.get("pivots", 0),
-    }
-    return render("curves.c", values)
+    library = keep_library("inverse", sources, (*_FLAGS, f"-DN={chart.n}"), folder)
+    has_library(SearchKernel(chart, library.parent))
+    return CompiledInverse(chart, library)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -142,7 +106,7 @@ class CompiledInverse(Shown):
         parts = self.chart.parts.inverse
         curves = parts.curves
         if curves is not None:
-            curves = CompiledCurves(curves.boxed, curves.starts, curves.tracer, lambda: self._c)
+            curves = replace(curves, kernel=SearchKernel(self.chart, self.library.parent))
         local, brief = partial(self._search, _ITERATIONS), partial(self._search, _FEW_ITERATIONS)
         return replace(parts, local=local, brief=brief, curves=curves)
 
@@ -172,32 +136,3 @@ class CompiledInverse(Shown):
     @cached_property
     def _c(self) -> Any:
         return load_library(self.library)
-
-
-@dataclass(frozen=True, eq=False)
-class CompiledCurves(SelfMotionCurves):
-    """Self-motion curves with their search in compiled C."""
-
-    library: Callable[[], Any]  #: the library with the code of `write_curve_source`
-
-    def search(self, targets: Array, own: Array, tolerance: float) -> Nearest:
-        """The nearest points for targets (N, n) of phi, from stored starts and one of the caller's (N, n)."""
-        best, between = Nearest.empty(own), np.zeros(len(own), dtype=np.int8)
-        library = self.library()
-        library.curve_room.restype, library.curve_rows.restype = ctypes.c_ulong, None
-        room = library.curve_room()
-
-        # Later stages of starts serve only rows that the earlier ones leave without a solution.
-        def search_piece(first: int) -> None:
-            rows = slice(first, first + _CURVE_PIECE)
-            stages = self.stages(targets[rows], own[rows])
-            starts = np.concatenate(stages).transpose(1, 0, 2)
-            inputs = (np.ascontiguousarray(array) for array in (targets[rows], starts))
-            arrays = (*inputs, np.empty(room, dtype=np.uint8), best.q[rows], best.distance[rows], between[rows])
-            phi, q_start, *others = (ctypes.c_void_p(array.ctypes.data) for array in arrays)
-            counts = ctypes.c_long(len(stages[0])), ctypes.c_long(starts.shape[1])
-            library.curve_rows(ctypes.c_long(len(starts)), phi, q_start, *counts, ctypes.c_double(tolerance), *others)
-
-        run_in_threads(search_piece, range(0, len(own), _CURVE_PIECE))
-        best.between[:] = between
-        return best

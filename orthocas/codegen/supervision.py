@@ -157,7 +157,7 @@ def describe_law(controller: Controller) -> dict[str, Any]:
 
 
 def describe_supervision(controller: Controller, safety: Safety) -> dict[str, Any]:
-    """Values of the templates about the supervised law: settings, boundary, memory, and orientations."""
+    """Values that the templates need for the supervised law: settings, boundary, memory and orientations."""
     problem, robot, domain = controller.problem, controller.problem.robot, controller.problem.domain
     lower, upper = domain.bounds
     path, relative = domain.path_bound, Relative(problem.task)

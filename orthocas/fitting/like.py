@@ -175,7 +175,7 @@ class Like:
         q = ca.SX.sym("q", robot.n)
         # a task stands for its components, relative to the centre of the domain
         if isinstance(like, Task):
-            if like.robot.joint_names != robot.joint_names:
+            if not like.robot.tree.equals(robot.tree):
                 raise InvalidValueError("like", "a task of another robot", "one of the problem's robot")
             like = like.with_reference_at(problem.domain.home)
             labels = zip(like.labels, like.units, strict=True)

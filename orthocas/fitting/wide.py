@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 import time
 import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 
@@ -39,6 +39,7 @@ from orthocas.fitting.wide_search import (
     WideSolution,
     find_best,
     is_on_side_of_centre,
+    sample_plain_frames,
     search_families,
 )
 from orthocas.robots.robot import Robot
@@ -50,10 +51,10 @@ from orthocas.tasks.domains import Box
 from orthocas.tasks.metric import Metric, MetricSpec
 from orthocas.tasks.problem import Problem, check
 from orthocas.tasks.regular_box import find_home
-from orthocas.tasks.samples import find_idle_joints, sample_problem
+from orthocas.tasks.samples import find_idle_joints, sample_problem, sample_uniform
 from orthocas.tasks.task import Task
 from orthocas.tools.checks import Array, as_number, require_count, require_kind
-from orthocas.tools.display import number_list, percent
+from orthocas.tools.display import listed, number_list, percent
 from orthocas.tools.interrupts import remembered
 from orthocas.tools.progress import Monitor, silent
 
@@ -95,12 +96,12 @@ def fit_wide(
 
     The stages are these:
 
-    1. Under a whole pose or orientation, families without the last joint, and linear in the first one, come first. If
-       the first one can turn fully, families without both come before these. Then xi stays while base or tool turn
-       about their own axes: full turns close, and rolling the hand moves no other joint. The families are polynomials.
-       In another metric than the identity and with r = 1, MLP((24, 24, 24), raw=True) has the choice before each
-       polynomial: its leaks are smaller, but it has no proof in a useful time. A family is kept if it leaves out little
-       of the branch after all rounds of 4. Where the polynomial leaves out more than a tenth at first, 3 follows.
+    1. Under a whole pose or orientation, families without the last joint come first. If the first one can turn fully,
+       families without both come before these. Then xi stays while base or tool turn about their own axes: full turns
+       close, and rolling the hand moves no other joint. With r = 1, these are networks, MLP((24, 24, 24), raw=True):
+       they lean less into the task than polynomials, but have no proof in a useful time. With several coordinates or
+       `like`, they are polynomials, linear in the first joint. A family is kept if it leaves out little of the branch
+       after all rounds of 4. Where the first result leaves out more than a tenth, 3 follows.
     2. Polynomials that are linear in each joint on whose position self-motions do not depend, such as the first and the
        last one, descend with L-BFGS from linear coordinates across the task at the centre of the branch. They are best
        to prove, and hold at any turn of these joints. They ask that self-motions turn base and tool in one direction.
@@ -306,7 +307,7 @@ def _fit_most(problems: tuple[Problem, ...], fit_on: Callable[[Problem], WideFit
 def _choose_families(problem: Problem, like: Likeness | None) -> tuple[Polynomial | MLP, ...]:
     """Under a pose, families without the turn of the tool; first without that of the base, too, if it can turn fully.
 
-    These are polynomials, and before them small networks in another metric than the identity.
+    These are small networks for one coordinate, and polynomials for several, or if they are to mean something.
 
     Then come polynomials that are linear in the joints on whose position the self-motions do not depend, by proof. Then
     those that are so in such slides without limits only, if there are others: a joint that turns has one turn.
@@ -323,11 +324,15 @@ def _choose_families(problem: Problem, like: Likeness | None) -> tuple[Polynomia
     names, fewer = (tuple(robot.joint_names[k] for k in part) for part in (free, endless))
     families: list[Polynomial | MLP] = []
     for left_out in [[*tool, *turns]] * bool(tool and turns) + [tool] * bool(tool):
-        linear = tuple(robot.joint_names[k] for k in base if k not in left_out)
         without = tuple(robot.joint_names[k] for k in sorted(left_out))
-        if len(linear) + len(without) < robot.n - problem.r:
-            if like is None and not problem.metric.is_identity and problem.r == 1:
-                families.append(MLP(RULES.small_network, True, linear, without))
+        linear = tuple(robot.joint_names[k] for k in base if k not in left_out)
+        if len(linear) + len(without) >= robot.n - problem.r:
+            continue
+        if like is None and problem.r == 1:
+            # a joint with limits enters a network like others: linear in it, coordinates lean by up to 13 degrees more
+            unlimited = tuple(name for name in linear if np.isinf(robot.upper[robot.joint_names.index(name)]))
+            families.append(MLP(RULES.small_network, True, unlimited, without))
+        else:
             families.append(Polynomial(RULES.degree, linear, without=without))
     families.append(Polynomial(RULES.degree, names))
     if names != fewer:
@@ -436,7 +441,27 @@ def _finish(
         left_out=_describe_left_out(clear, branch, counted, share),
         meaning=error,
         like=quantities.measure_distances(problem, coordinates, seed) if quantities is not None and followed else {},
+        least_leak=_bound_leak(problem, getattr(coordinates.parametrisation, "without", ()), seed),
     )
+
+
+def _bound_leak(problem: Problem, without: Sequence[str], seed: int) -> float:
+    """Bound of the rms leak of one coordinate that does not depend on some joints S [deg]; 0 if nothing is known.
+
+    Of gradients v with v_S = 0, the nearest one to the self-motion z has the leak a, and none has a smaller one::
+
+        sin^2 a = (A z)_S^T (A_SS)^-1 (A z)_S / z^T A z        (A = I and the last joint: sin a = |z_n| / |z|)
+    """
+    if not without or problem.r > 1:
+        return 0.0
+    left_out = [problem.robot.joint_names.index(name) for name in without]
+    points = sample_uniform(problem.domain, RULES.bounded, (seed, RULES.bounded_tag))
+    A, z = problem.metric.evaluate(points), sample_plain_frames(problem, points).null_basis[:, :, 0]
+    momentum = np.einsum("sij,sj->si", A, z)
+    own = momentum[:, left_out]
+    part = np.linalg.solve(A[:, left_out][:, :, left_out], own[:, :, None])[:, :, 0]
+    squares = np.einsum("si,si->s", own, part) / np.einsum("si,si->s", momentum, z)
+    return float(np.degrees(np.sqrt(np.mean(np.arcsin(np.sqrt(np.clip(squares, 0.0, 1.0))) ** 2))))
 
 
 def _name_coordinates(
@@ -485,12 +510,14 @@ class WideFit(Fit):
     regular_share: float = float("nan")  #: of the clear positions of the branch, the share in the domain, from samples
     left_out: str = ""  #: what the fit left out of the branch from the start, and why
     meaning: MeaningError | None = None  #: how far xi is from what it is like, for r = 1
+    least_leak: float = 0.0  #: no coordinate without the joints that this one leaves out has a smaller leak, rms [deg]
 
     def facts(self) -> dict[str, str]:
         """The facts of a fit, with branch and regular share."""
         facts = super().facts()
         share = percent(self.regular_share, 2)
         named, meaning = self.chart.parts.named_coordinates, ""
+        joints = listed(getattr(self.chart.coordinates.parametrisation, "without", ()))
         clear = "clear and free" if FREE in self.chart.notes else "clear"
         if "exact" in self.chart.notes:
             meaning = f"{'; '.join(named)}, exactly"
@@ -500,6 +527,11 @@ class WideFit(Fit):
             "branch": self.branch.name,
             "regular": f"{share} of the branch's {clear} positions (samples); the domain is this part",
             **({"left out": self.left_out} if self.left_out else {}),
+            **(
+                {"least leak": f"{self.least_leak:.1f} deg rms, of any coordinate without {joints}"}
+                if self.least_leak
+                else {}
+            ),
             **({"meaning": meaning} if meaning else {}),
         }
         return {"fit": facts.pop("fit"), "problem": facts.pop("problem"), **own, **facts}

@@ -2,7 +2,6 @@
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
-from itertools import groupby
 
 import numpy as np
 import scipy
@@ -39,7 +38,7 @@ class WideRules:
     degree: int = 6  #: of polynomials that are linear in base and tool joints
     degree_of_all: int = 5  #: of polynomials in which these count like all others
     network: tuple[int, ...] = (64, 64, 64)  #: layers where polynomials leave out much
-    small_network: tuple[int, ...] = (24, 24, 24)  #: layers in another metric than the identity; as fast as polynomials
+    small_network: tuple[int, ...] = (24, 24, 24)  #: layers of those that leave out joints
 
     alignment: float = 0.3  #: weight of the mean sin^2 of the leaks
     alignment_in_metric: float = 1.0  #: the same in another metric than the identity
@@ -85,6 +84,8 @@ class WideRules:
     very_poor: float = 2e-2  #: fraction above which it is a network at once
     still_poor: float = 6e-3  #: fraction above which it is a network after polynomials in all joints
 
+    bounded: int = 2000  #: positions whose mean bounds the leak
+    bounded_tag: int = 3004  #: their seed tag
     first: int = 200  #: samples that scale coordinates
     first_tag: int = 1000  #: their seed tag
     tag: int = 3000  #: seed tag of the samples of a descent
@@ -136,20 +137,15 @@ def search_families(searches: Sequence["Search"]) -> "Search":
     """
     symmetric = [search for search in searches if search.left_out]
     hopeless = False
-    for _, group in groupby(symmetric, key=lambda search: search.left_out):
-        # the polynomial begins: in a third of a network's time, it shows where neither has a chance
-        *networks, last = group
-        last.begin(f"{_STAGE}, {last.parametrisation.label}")
-        hopeless = last.rank[1] > RULES.hopeless
-        for search in (*([] if hopeless else networks), last):
-            if search is not last:
-                search.begin(f"{_STAGE}, {search.parametrisation.label}")
-            most = RULES.poor_without_turns if len(search.left_out) > 1 else RULES.poor_without_tool
-            # rounds with the worst samples divide the fraction of bad positions by two to four
-            if search.is_enough(4 * most):
-                search.go_on()
-            if search.is_enough(most) or len(searches) == 1:
-                return search
+    for search in symmetric:
+        search.begin(f"{_STAGE}, {search.parametrisation.label}")
+        most = RULES.poor_without_turns if len(search.left_out) > 1 else RULES.poor_without_tool
+        # rounds with the worst samples divide the fraction of bad positions by two to four, by two without the base
+        if search.is_enough(4 / len(search.left_out) * most):
+            search.go_on()
+        if search.is_enough(most) or len(searches) == 1:
+            return search
+        hopeless = search.rank[1] > RULES.hopeless
     first, *others = searches[len(symmetric) :]
     # what is linear in base and tool is as bad then
     if not hopeless or all(search.linear for search in others):

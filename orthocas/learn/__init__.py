@@ -141,7 +141,7 @@ class PhiActions(gymnasium.Wrapper[Array, Array, Array, Array]):
 def coordinates_of(chart: Chart, q: ArrayLike) -> Array:
     """phi = (x, xi) of a trajectory q (T, n), such as the states or the actions of an episode; (T, n).
 
-    It is `chart.phi` where `joints_of` finds the way back.
+    It equals `chart.phi`, but refuses positions outside the domain, from which `joints_of` may not lead back.
 
     Raises:
         DomainError: if a row lies outside the domain; the message names the first.

@@ -41,6 +41,14 @@ class CurveRules:
     halvings: int = 4  #: of a step, to look closely
     nodes: int = 8000  #: points on all curves of a task value, at most
     crossings: int = 4000  #: of limits, at most
+    spacing: float = 0.05  #: of points among which the best posture of a task value is sought
+    samples: int = 20_000  #: such points of a curve, at most
+    candidates: int = 12  #: of them next to which it is sought
+    nearly: float = 2e-3  #: from limits, within which a point of a cubic may be outside
+    rounded: float = 1e-11  #: beyond limits, of exact points
+    narrowed: float = 1e-11  #: of the place of the best posture
+    piece: int = 8  #: rows that a thread takes at once
+    rounds: int = 60  #: of the search for it, at most
 
 
 RULES = CurveRules()

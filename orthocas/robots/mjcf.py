@@ -8,7 +8,7 @@ import numpy as np
 import pinocchio as pin
 
 from orthocas.errors import RobotError, one_line
-from orthocas.robots.pinocchio_model import Mimic, resolve_mimics
+from orthocas.robots.pinocchio_model import Mimic, resolve_mimics, suggest_lock
 from orthocas.robots.urdf import RULES, read_xml
 from orthocas.tools.checks import Array, as_path, import_extra
 
@@ -89,7 +89,7 @@ def _convert(mujoco: Any, compiled: Any, name: str) -> pin.Model:
 
 def _find_mimics(mujoco: Any, compiled: Any, locked: Mapping[str, float]) -> dict[str, Mimic]:
     """Joints that follow others: q1 - ref1 = a0 + a1 (q2 - ref2), where MuJoCo's polynomial has no higher terms."""
-    direct = {}
+    direct = dict[str, Mimic]()
     for i in range(compiled.neq):
         first, second = int(compiled.eq_obj1id[i]), int(compiled.eq_obj2id[i])
         coupled = compiled.eq_type[i] == mujoco.mjtEq.mjEQ_JOINT and second >= 0 and compiled.eq_active0[i]
@@ -100,7 +100,12 @@ def _find_mimics(mujoco: Any, compiled: Any, locked: Mapping[str, float]) -> dic
         if names[0] in locked:
             continue
         ref1, ref2 = (float(compiled.qpos0[compiled.jnt_qposadr[k]]) for k in (first, second))
-        direct[names[0]] = Mimic(names[1], float(a1), ref1 + float(a0) - float(a1) * ref2)
+        coupling = Mimic(names[1], float(a1), ref1 + float(a0) - float(a1) * ref2)
+        if direct.setdefault(names[0], coupling) != coupling:
+            raise RobotError(
+                f"joint '{names[0]}' is coupled to '{direct[names[0]].leader}' and, otherwise, to '{names[1]}', "
+                f"expected one linear coupling of a joint: {suggest_lock(names[0])}"
+            )
     return resolve_mimics(direct)
 
 

@@ -6,6 +6,7 @@ from typing import Any, Protocol, Self
 import coal
 import numpy as np
 import scipy
+from numpy.typing import NDArray
 
 from orthocas.tools.checks import Array, Flags
 
@@ -16,6 +17,7 @@ class ShapeRules:
 
     facets: int = 12  #: of the prism around a cylinder that its bound is made of
     flat: float = 1e-9  #: [m], of point sets without a volume
+    fan: int = 60  #: triangles of a plane face with which corners may have more neighbours than coal can count, 255
 
 
 RULES = ShapeRules()
@@ -165,7 +167,15 @@ class HullGeometry(Geometry):
         hull = scipy.spatial.ConvexHull(points)
         places = np.zeros(len(points), dtype=np.intp)
         places[hull.vertices] = np.arange(len(hull.vertices))
-        return cls(points[hull.vertices], places[hull.simplices])
+        corners, faces = points[hull.vertices], places[hull.simplices]
+        # Qhull divides a plane face into a fan from one corner, which then has hundreds of neighbours; halves give few.
+        _, owners, counts = np.unique(hull.equations, axis=0, return_inverse=True, return_counts=True)
+        for face in np.flatnonzero(counts > RULES.fan):
+            own = owners.ravel() == face
+            ring = _order_around(corners, np.unique(faces[own]), hull.equations[own][0, :3])
+            faces = np.concatenate([faces[~own], _halve(ring)])
+            owners = np.concatenate([owners.ravel()[~own], np.full(len(ring) - 2, face)])
+        return cls(corners, faces)
 
     def build(self) -> Any:
         """The hull."""
@@ -187,6 +197,22 @@ class HullGeometry(Geometry):
         offsets = np.einsum("fi,fi->f", normals, corners[:, 0])
         outwards = np.sign(offsets - normals @ self.points.mean(axis=0))
         return np.asarray((outwards * (points @ normals.T - offsets) <= 0).all(axis=1))
+
+
+def _order_around(points: Array, ring: NDArray[np.intp], normal: Array) -> NDArray[np.intp]:
+    """The corners of a plane convex polygon, (K,) places among points, in their order along its edge."""
+    across = scipy.linalg.null_space(normal[None])
+    u, v = ((points[ring] - points[ring].mean(axis=0)) @ across).T
+    return ring[np.argsort(np.arctan2(v, u))]
+
+
+def _halve(ring: NDArray[np.intp]) -> NDArray[np.intp]:
+    """Triangles (K - 2, 3) of a convex polygon (K,), cut in halves: no corner is one of more than 4 log2 K of them."""
+    if len(ring) == 3:
+        return ring[None]
+    middle = len(ring) // 2
+    first, second = ring[: middle + 1], np.append(ring[middle:], ring[0])
+    return np.concatenate([_halve(part) for part in (first, second) if len(part) > 2])
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,7 +1,7 @@
 """The numbers of a kinematic tree: Pinocchio's robot as plain data, which chart files store."""
 
 from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field, fields, replace
 from typing import Any, Literal
 
 import casadi as ca
@@ -185,6 +185,10 @@ class KinematicTree:
         for i, name in enumerate(self.body_joints):
             links = [frame for frame, parent in frames if parent == i]
             require_body(name, self.masses[i], self.inertias[i], self.armatures[i], links)
+
+    def equals(self, other: "KinematicTree") -> bool:
+        """Whether all names and numbers are the same, as those of one file that was read twice are."""
+        return other is self or all(np.array_equal(getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
 
     @property
     def tip(self) -> Frame:

@@ -162,7 +162,7 @@ class Friction:
     stribeck_speed: ArrayLike = RULES.stribeck_speed
 
     def numbers(self, n: int) -> Array:
-        """Viscous and Coulomb friction of n joints, what breaking away takes beyond it, and its speed, (4 n,)."""
+        """Viscous friction, Coulomb friction, breakaway minus Coulomb friction, Stribeck speed of n joints, (4 n,)."""
         viscous, coulomb = (non_negative_gains(name, getattr(self, name), n) for name in ("viscous", "coulomb"))
         breakaway = coulomb if self.breakaway is None else non_negative_gains("breakaway", self.breakaway, n)
         if (breakaway < coulomb).any():

@@ -355,14 +355,9 @@ def run_ticks(
     Raises:
         SimulationError: if the integrator gives up.
     """
-    # Whole ticks: the reference ends with its last segment.
-    ticks = int(np.floor(reference.duration * rate + 1e-9))
-    times = np.arange(ticks) / rate
-    columns = (
-        np.hstack(reference.sample(times)),
-        noise.sample(ticks, loop.n)[:, : loop.size],
-        loop.loads.mean(times, 1 / rate),
-    )
+    times, target, errors = sample_ticks(loop, reference, rate, noise)
+    columns = (target, errors[:, : loop.size], loop.loads.mean(times, 1 / rate))
+    ticks = len(times)
     k, period = len(reference.labels), 1 / rate
     run = _build_ticks(loop, period, k, tolerance) if compiled is None else compiled.ticks(period, tolerance)
     state = start
@@ -376,6 +371,13 @@ def run_ticks(
         # Its expressions share nodes with those that other threads build.
         with building:
             del run
+
+
+def sample_ticks(loop: ClosedLoop, reference: Reference, rate: float, noise: Noise) -> tuple[Array, Array, Array]:
+    """Starts of the ticks (N,) [s], references with derivatives (N, 3 k), errors of the sensors (N, 2 n)."""
+    # Whole ticks: the reference ends with its last segment.
+    times = np.arange(int(np.floor(reference.duration * rate + 1e-9))) / rate
+    return times, np.hstack(reference.sample(times)), noise.sample(len(times), loop.n)
 
 
 def yield_pieces(tick: Callable[[int], Array], times: Array, period: float, size: int) -> Iterator[Piece]:

@@ -474,7 +474,6 @@ class MuJoCoPlant(Shown):
         first order takes eighths. Springs K need steps of at most 1 / frequency with both, the root of the largest
         eigenvalue of M^-1 K.
         """
-        # The largest eigenvalues of M^-1 D and M^-1 K, of all joints and rotors.
         # D and K of all joints and rotors, and the largest eigenvalues of M^-1 D and M^-1 K.
         M, D = np.zeros((self.model.nv,) * 2), np.diag(self.model.dof_damping)
         mujoco().mj_fullM(self.model, self.data, M)

@@ -13,7 +13,7 @@ from orthocas.control.reference import Reference
 from orthocas.control.safety import Safety
 from orthocas.errors import InvalidValueError
 from orthocas.simulation.disturbances import Loads, Noise
-from orthocas.simulation.loops import ClosedLoop, Piece, build_held_plant, run_compiled, yield_pieces
+from orthocas.simulation.loops import ClosedLoop, Piece, build_held_plant, run_compiled, sample_ticks, yield_pieces
 from orthocas.simulation.mujoco_plant import MuJoCo, MuJoCoPlant
 from orthocas.tools.cached import building
 from orthocas.tools.checks import Array, as_number, require_kind
@@ -116,9 +116,8 @@ def run_supervised(
         SimulationError: if CVODES gives up.
     """
     n, size = loop.n, len(start)
-    ticks = int(np.floor(reference.duration * rate + 1e-9))
-    times = np.arange(ticks) / rate
-    target, errors, loads = np.hstack(reference.sample(times)), noise.sample(ticks, n), loop.loads.mean(times, 1 / rate)
+    times, target, errors = sample_ticks(loop, reference, rate, noise)
+    loads = loop.loads.mean(times, 1 / rate)
     # CasADi may lose Ctrl-C while it builds functions.
     with deferred(), building:
         plant = build_held_plant(loop, 1 / rate, tolerance)
@@ -166,9 +165,7 @@ def run_physics(
     holding = plant.bias
     plant.reset(start[: loop.n], start[loop.n :])
     # What each tick needs: targets with derivatives, errors of the sensors, and the share of it that each push lasts.
-    ticks = int(np.floor(reference.duration * rate + 1e-9))
-    times = np.arange(ticks) / rate
-    target, errors = np.hstack(reference.sample(times)), noise.sample(ticks, loop.n)
+    times, target, errors = sample_ticks(loop, reference, rate, noise)
     shares = loop.loads.shares(times, 1 / rate)
     # CasADi may lose Ctrl-C while it builds functions.
     with deferred(), building:

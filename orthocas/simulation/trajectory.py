@@ -60,16 +60,14 @@ _OF_JOINTS = ("q", "dq", "command")  #: one number for every joint; the others f
 _REQUIRED = tuple(name for name in _ARRAYS if name not in _LATER)
 
 
-def read_run_file(
-    path: Path, version: int, names: Sequence[str], later: Sequence[str] = ()
-) -> tuple[dict[str, Any], dict[str, Stored]]:
-    """Header and the named arrays of a run, and the later ones if the file has them; other entries are left alone.
+def read_run_file(path: Path) -> tuple[dict[str, Any], dict[str, Stored]]:
+    """Header and arrays of a run, later ones if the file has them; other entries are left alone.
 
     Raises:
         TrajectoryFileError: if the file is missing, damaged, foreign or from a newer version.
     """
     with open_archive(path, "trajectory", TrajectoryFileError) as zipped:
-        entries = ["header", *names, *(name for name in later if f"{name}.npy" in zipped.sizes)]
+        entries = ["header", *_REQUIRED, *(name for name in _LATER if f"{name}.npy" in zipped.sizes)]
         zipped.require_room([f"{name}.npy" for name in entries])
         try:
             stored = {name: read_npy(zipped.read(f"{name}.npy")) for name in entries}
@@ -78,9 +76,9 @@ def read_run_file(
             if isinstance(error, TrajectoryFileError):
                 raise
             raise TrajectoryFileError(f"{path} contains an array or a header that cannot be read: {error}") from None
-    if not isinstance(header, dict) or header.get("version") != version:
+    if not isinstance(header, dict) or header.get("version") != _VERSION:
         saved = header.get("version") if isinstance(header, dict) else None
-        raise TrajectoryFileError(f"{path} has version {saved}, this orthocas reads {version}")
+        raise TrajectoryFileError(f"{path} has version {saved}, this orthocas reads {_VERSION}")
     return header, stored
 
 
@@ -224,7 +222,7 @@ class Trajectory(Shown):
             TrajectoryFileError: if the file is missing, damaged, foreign or from a newer version.
         """
         path = as_path("path", path)
-        header, arrays = read_run_file(path, _VERSION, _REQUIRED, _LATER)
+        header, arrays = read_run_file(path)
         try:
             # The header first: it says which shapes the arrays must have.
             names: dict[str, Any] = {name: tuple(get_part(header, name, list)) for name in ("labels", "joint_names")}
@@ -272,13 +270,13 @@ assert set(_ARRAYS) < {field.name for field in fields(Trajectory)}
 def find_loss(run: Trajectory, controller: Controller, pushes: Sequence[Push], supervised: bool) -> str:
     """Why a law lost its arm in a run, in words; empty if it kept it.
 
-    It lost the arm where the arm left the domain of the law's chart, in which alone the law commands; with a law
-    without a chart, where it left the joint limits. A supervised law may leave them and come back, and its catcher may
-    hold the arm outside.
+    A law loses its arm in two ways. The arm leaves the domain of the law's chart, outside of which the law commands
+    nothing; for a law without a chart, the joint limits. A supervised law may come back, and its catcher may hold the
+    arm outside.
 
-    It also lost the arm where motors were at their limit for a time, and the storage V, the energy of springs
-    and motion, was larger after that time than before. This counts at the end of the run, and where the catcher of a
-    supervised law had to take over meanwhile, without a push.
+    Or motors are at their limit for a time, after which the storage V, the energy of springs and motion, is larger than
+    before. This counts if that time lasts to the end of the run, or if the catcher of a supervised law took over during
+    it without a push.
 
     Args:
         run: the run, in the quantities of the law.

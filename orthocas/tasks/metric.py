@@ -17,11 +17,13 @@ from orthocas.robots.robot import Robot
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, freeze_array, require_kind, require_known, require_text
+from orthocas.tools.display import listed
 from orthocas.tools.expressions import HoldsFunctions, build_expression, call_user
 
 METRIC_KINDS = ("euclidean", "inertia")
 MetricSpec = str | ArrayLike | Callable[[ca.SX], ca.SX]  #: what `Metric.from_spec` accepts
 _SINGULAR = 1e-12  #: eigenvalue, relative to the largest entry, that counts as zero
+_TAKES_PART = 0.1  #: share of the largest entry of an eigenvector above which a joint takes part in its motion
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +113,8 @@ class Metric(HoldsFunctions):
         if self.is_identity:
             return np.broadcast_to(np.eye(n), (len(points), n, n))
         A = self.batched(points)[0].reshape(-1, n, n)
-        require_spd(A, points)
+        missing = ": give links between these joints mass or armature, lock one, or take metric='euclidean'"
+        require_spd(A, points, missing if self.is_inertia else "")
         return A
 
     @property
@@ -154,7 +157,7 @@ def register_metric(name: str, build: Callable[[Robot], Callable[[ca.SX], ca.SX]
     _REGISTERED[name] = build
 
 
-def require_spd(matrices: Array, points: Array) -> None:
+def require_spd(matrices: Array, points: Array, advice: str = "") -> None:
     """Raise MetricError, with the worst point, unless all matrices (N, n, n) are symmetric positive definite."""
     if not len(matrices):
         return
@@ -180,9 +183,12 @@ def require_spd(matrices: Array, points: Array) -> None:
     smallest = np.linalg.eigvalsh(matrices)[:, 0]
     worst = int(np.argmin(smallest - _SINGULAR * size))
     if smallest[worst] <= _SINGULAR * size[worst]:
+        # the joints that turn against each other in this motion
+        motion = np.abs(np.linalg.eigh(matrices[worst])[1][:, 0])
+        joints = listed(str(k + 1) for k in np.flatnonzero(motion > _TAKES_PART * motion.max()))
         raise MetricError(
-            f"metric has eigenvalue {smallest[worst]:.3g} at q = {np.round(points[worst], 4).tolist()}, "
-            "expected symmetric positive definite"
+            f"metric has eigenvalue {smallest[worst]:.3g} at q = {np.round(points[worst], 4).tolist()} along a motion "
+            f"of joints {joints} (from 1), expected symmetric positive definite{advice}"
         )
 
 

@@ -82,7 +82,7 @@ class Problem(Shown):
         # Robot and task belong together, and the task leaves some freedom.
         require_kind("robot", robot, Robot)
         require_kind("task", task, Task)
-        if task.robot is not robot:
+        if not task.robot.tree.equals(robot.tree):
             raise InvalidValueError("task", f"a task of another robot ({task.name})", "a task built on the same robot")
         if task.m >= robot.n - len(robot.tree.floating):
             raise NotRedundantError(task.m, robot.n - len(robot.tree.floating))

@@ -320,7 +320,7 @@ class Task(Shown, HoldsFunctions):
         """
         for task in tasks:
             require_kind("task", task, Task)
-            if task.robot is not tasks[0].robot:
+            if not task.robot.tree.equals(tasks[0].robot.tree):
                 raise InvalidValueError("tasks", "of different robots", "tasks of one robot")
         if not tasks:
             raise InvalidValueError("tasks", "none", "at least one")

@@ -69,7 +69,7 @@ class Batched:
                 self._mapped[chunk] = self.function.map(chunk, *how)
         # Large sets run in threads of CasADi; small ones in buffers that each thread keeps.
         if chunk == _LARGE:
-            return evaluate_columns(self._mapped[chunk], chunk, *arguments)
+            return _Columns(self._mapped[chunk], chunk)(*arguments)
         if not hasattr(self._mine, "columns"):
             self._mine.columns = {}
         mine: dict[int, _Columns] = self._mine.columns
@@ -79,11 +79,6 @@ class Batched:
 
     def __reduce__(self) -> tuple[type, tuple[ca.Function]]:
         return Batched, (self.function,)
-
-
-def evaluate_columns(function: ca.Function, chunk: int, *arguments: Array) -> list[Array]:
-    """Like `Batched`, for a function that takes `chunk` samples side by side as columns."""
-    return _Columns(function, chunk)(*arguments)
 
 
 class _Columns:

@@ -15,12 +15,12 @@ from orthocas.tools.checks import Array
 from orthocas.tools.interrupts import deferred
 
 
-class NumpyNode(ca.Callback):
-    """A node of an MX graph that NumPy evaluates in place. It has no derivatives."""
+class DenseNode(ca.Callback):
+    """A node of an MX graph with dense matrices, which Python evaluates; subclasses have `eval_buffer`."""
 
-    def __init__(self, name: str, inputs: Sequence[tuple[int, int]], output: tuple[int, int]) -> None:
+    def __init__(self, name: str, inputs: Sequence[tuple[int, int]], outputs: Sequence[tuple[int, int]]) -> None:
         ca.Callback.__init__(self)
-        self._inputs, self._output = tuple(inputs), output
+        self._inputs, self._outputs = tuple(inputs), tuple(outputs)
         self.construct(name, {})
 
     def get_n_in(self) -> int:
@@ -28,8 +28,8 @@ class NumpyNode(ca.Callback):
         return len(self._inputs)
 
     def get_n_out(self) -> int:
-        """One output matrix."""
-        return 1
+        """Number of output matrices."""
+        return len(self._outputs)
 
     def get_sparsity_in(self, i: int) -> ca.Sparsity:
         """Dense."""
@@ -37,16 +37,20 @@ class NumpyNode(ca.Callback):
 
     def get_sparsity_out(self, i: int) -> ca.Sparsity:
         """Dense."""
-        return ca.Sparsity.dense(*self._output)
+        return ca.Sparsity.dense(*self._outputs[i])
 
     def has_eval_buffer(self) -> bool:
         """Tell CasADi to pass buffers, so that nothing is copied."""
         return True
 
+
+class NumpyNode(DenseNode):
+    """A node with one output that NumPy evaluates in place. It has no derivatives."""
+
     def eval_buffer(self, arg: Sequence[Any], res: Sequence[Any]) -> int:
         """Evaluate the node. CasADi stores matrices column by column, so NumPy sees them transposed."""
         inputs = [np.frombuffer(memory).reshape(shape[::-1]) for memory, shape in zip(arg, self._inputs, strict=True)]
-        self.compute(inputs, np.frombuffer(res[0]).reshape(self._output[::-1]))
+        self.compute(inputs, np.frombuffer(res[0]).reshape(self._outputs[0][::-1]))
         return 0
 
     def compute(self, transposed: list[Array], result: Array) -> None:
@@ -59,7 +63,7 @@ class Product(NumpyNode):
 
     def __init__(self, a: tuple[int, int], b: tuple[int, int], flip_a: bool, flip_b: bool) -> None:
         self._flips = flip_a, flip_b
-        NumpyNode.__init__(self, "product", (a, b), (a[1] if flip_a else a[0], b[0] if flip_b else b[1]))
+        NumpyNode.__init__(self, "product", (a, b), [(a[1] if flip_a else a[0], b[0] if flip_b else b[1])])
 
     def compute(self, transposed: list[Array], result: Array) -> None:
         """(op(A) op(B))^T = op(B)^T op(A)^T."""
@@ -71,7 +75,7 @@ class Tanh(NumpyNode):
     """tanh of every entry."""
 
     def __init__(self, shape: tuple[int, int]) -> None:
-        NumpyNode.__init__(self, "tanh", [shape], shape)
+        NumpyNode.__init__(self, "tanh", [shape], [shape])
 
     def compute(self, transposed: list[Array], result: Array) -> None:
         """Evaluate tanh of all entries."""

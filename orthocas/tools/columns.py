@@ -189,19 +189,15 @@ def fill(results: NDArray[Any], points: Array, make: Callable[[], BlockFunction]
 def fill_blocks(results: NDArray[Any], function: BlockFunction, columns: int, *arguments: Array) -> None:
     """Fill the results in this thread, by calls of one function on blocks of `columns` columns."""
     for first in range(0, len(results), columns):
-        count = min(columns, len(results) - first)
-        values = function(*(_fill_columns(array[first : first + columns], columns) for array in arguments))
+        count, blocks = min(columns, len(results) - first), [np.empty((array.shape[1], columns)) for array in arguments]
+        for block, array in zip(blocks, arguments, strict=True):
+            # Samples as columns; the last block is padded with its first sample.
+            block[:, :count] = array[first : first + count].T
+            block[:, count:] = array[first : first + 1].T
+        values = function(*blocks)
         by_entry = values.reshape(*results.shape[1:], columns)[..., :count]
         # moveaxis takes longer
         results[first : first + columns] = by_entry.transpose(-1, *range(by_entry.ndim - 1))
-
-
-def _fill_columns(points: Array, columns: int) -> Array:
-    """Joint positions (k, n) as columns (n, c). The last block is padded with its first position."""
-    filled = np.empty((points.shape[1], columns))
-    filled[:, : len(points)] = points.T
-    filled[:, len(points) :] = points[:1].T
-    return filled
 
 
 class BlockedFunction:
@@ -240,7 +236,7 @@ class BlockedFunction:
 
     def _build_function(self, narrow: bool = False) -> BlockFunction:
         """The function of a block."""
-        rows = self._by_narrow_rows if narrow else self._by_rows
+        rows = ColumnFunction(self._entries, NARROW) if narrow else self._by_rows
         assert rows is not None
         run = rows.build_block_function()
         return lambda *columns: run(*columns)[0]
@@ -255,11 +251,6 @@ class BlockedFunction:
         """The function with its entries row by row; None if it has an operation that columns do not support."""
         columns = ColumnFunction(self._entries)
         return columns if columns.supported else None
-
-    @cached_property
-    def _by_narrow_rows(self) -> ColumnFunction:
-        """`_by_rows` for narrow blocks."""
-        return ColumnFunction(self._entries, NARROW)
 
     @cached_property
     def _entries(self) -> ca.Function:

@@ -162,7 +162,7 @@ def test_known_arms_load_by_name() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(("name", "branches"), [("panda", 4), ("iiwa7", 8), ("baxter-left", 4), *nightly(("xarm7", 8))])
+@pytest.mark.parametrize(("name", "branches"), [("panda", 4), ("baxter-left", 4), *nightly(("iiwa7", 8), ("xarm7", 8))])
 def test_ready_arms_have_charts_of_all_branches(name: str, branches: int) -> None:
     """Held-out postures of each domain: xi rises along the self-motion, and x and xi lead back to the branch."""
     arm = oc.Arm.load(name)
@@ -265,6 +265,7 @@ def test_full_turns_of_endless_joints_bring_postures_into_a_box() -> None:
     assert np.linalg.norm(near.q - q, axis=1).max() < 0.05
 
 
+@pytest.mark.slow
 def test_postures_at_which_a_closed_curve_begins_are_found() -> None:
     """Curves of these x begin at the postures themselves, which are stored, and there xi is met up to rounding."""
     known = oc.problems.get("planar_3r_xy")

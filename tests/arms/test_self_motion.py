@@ -2,6 +2,7 @@
 
 import importlib.util
 import shutil
+from collections.abc import Callable
 from functools import cache
 
 import numpy as np
@@ -265,3 +266,29 @@ def test_gap_and_merge_of_a_planar_arm_are_those_of_its_linkage() -> None:
         motions.gap(1, 1)
     with pytest.raises(InvalidValueError, match="one of 2 components"):
         motions.merge(0, 5)
+
+
+@needs_c
+@pytest.mark.parametrize("which", [panda, planar])
+def test_solve_gives_the_best_posture_of_all_arcs(which: Callable[[], oc.Arm]) -> None:
+    """No point of the arcs, 2 mrad apart, is nearer to the start or farther from the limits, but for rounding."""
+    arm = which()
+    starts = postures(arm, 4, 12)
+    x = arm.x(postures(arm, 4, 11))
+    near, free = arm.solve(x, start=starts), arm.solve(x)
+    assert near.found.all()
+    assert free.found.all()
+    np.testing.assert_allclose(arm.x(near.q), x, atol=1e-9)
+    np.testing.assert_allclose(arm.x(free.q), x, atol=1e-9)
+    bounded, ranges = np.isfinite(arm.robot.lower), arm.robot.upper - arm.robot.lower
+    for row, start in enumerate(starts):
+        motions = arm.self_motion(x[row])
+        q = np.vstack([arc.at(np.arange(0.0, arc.length, 2e-3)) for arc in motions])
+        away = np.linalg.norm(motions.measure_away(np.vstack([near.q[row], q]), start), axis=1)
+        assert away[0] <= away[1:].min() + 1e-9
+        assert away[0] > away[1:].min() - 1e-3
+        every = np.vstack([free.q[row], q])
+        room = np.minimum(every - arm.robot.lower, arm.robot.upper - every)[:, bounded] / ranges[bounded]
+        least = room.min(axis=1, initial=0.5)
+        assert least[0] >= least[1:].max() - 1e-9
+        assert least[0] < least[1:].max() + 1e-3

@@ -47,6 +47,7 @@ KINDS: dict[str, Callable[[], oc.Chart]] = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("kind", KINDS)
 def test_ends_of_a_range_are_found_from_there(kind: str) -> None:
     """Newton's method alone jumps past some: at 90 % of the ranges of xarm7-wide, 81 of 720."""

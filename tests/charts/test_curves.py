@@ -3,10 +3,11 @@
 import numpy as np
 import pytest
 from dense_search import STARTS, positions_at
-from programs import nightly
+from programs import needs_c, nightly
 from public_objects import wide
 
 import orthocas as oc
+from orthocas.charts.curves import SelfMotionCurves
 from orthocas.tasks.samples import sample_uniform
 
 FOUND, NEAREST = oc.InverseStatus.FOUND, oc.InverseStatus.NEAREST
@@ -133,3 +134,26 @@ def test_orientations_are_embedded_without_a_seam() -> None:
     error = np.linalg.norm(chart.parts.relative.difference(x, y)[:, 3:], axis=1)
     apart = np.linalg.norm(chart.parts.relative.embed(x) - chart.parts.relative.embed(y), axis=1)
     np.testing.assert_allclose(apart, error, rtol=1e-4, atol=1e-12)
+
+
+@needs_c
+@pytest.mark.parametrize("name", ["panda-wide", "iiwa7-pose", *nightly("xarm7-wide", "baxter-left-wide")])
+def test_without_a_compiler_answers_are_the_same(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """NumPy and C find as much: equal statuses, nearest xi and sets of all solutions, to 2e-10."""
+    chart, rng = oc.load(name), np.random.default_rng(4)
+    wishes = chart.domain.sample(60, 1)
+    phi = chart.phi(chart.domain.sample(60, 2))
+    phi[:, chart.m] += rng.normal(0.0, 0.7, 60)  # some beyond what the chart has there
+    near, every = chart.solve(phi, wishes, inside=True), [chart.solutions(row) for row in phi[:20]]
+    assert chart.parts.inverse.curves is not None
+    assert chart.parts.inverse.curves.has_kernel
+    monkeypatch.setattr(SelfMotionCurves, "has_kernel", False)
+    other = chart.solve(phi, wishes, inside=True)
+    np.testing.assert_array_equal(near.status, other.status)
+    assert {oc.InverseStatus.FOUND, oc.InverseStatus.NEAREST} <= set(near.statuses)
+    np.testing.assert_allclose(near.distance, other.distance, atol=2e-10)
+    for row, found in zip(phi, every, strict=False):
+        others = chart.solutions(row)
+        assert len(found) == len(others)
+        for q in found:
+            assert np.abs(others - q).max(axis=1).min() < 2e-10

@@ -45,11 +45,12 @@ def test_self_motion_of_a_planar_arm_is_the_closed_form() -> None:
     np.testing.assert_allclose(motion.q, expected, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["panda-wide", "xarm7-pose", "circle"])
 def test_c_and_python_end_at_the_same_places(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
     """Without a C compiler, Python follows the curves: ranges agree to 1e-9, and so do ends of self-motions."""
     chart = circle() if name == "circle" else oc.load(name)
-    q = chart.domain.sample(20, 5)
+    q = chart.domain.sample(6 if name == "circle" else 20, 5)
     in_c = [(chart.xi_range(point), chart.self_motion(point)) for point in q]
     monkeypatch.setattr(type(chart.parts), "motion_kernel", None)
     for point, (reach, motion) in zip(q, in_c, strict=True):
@@ -85,10 +86,11 @@ def test_without_a_library_python_follows_the_curves(
     assert len(chart.xi_range(chart.domain.centre)) == 1
 
 
+@pytest.mark.slow
 def test_ranges_of_a_grown_chart_end_where_it_ends() -> None:
-    """Of 12 postures one is outside the chart; the curves of the others leave it, or the domain."""
+    """The curves of some postures leave the chart, those of others the domain."""
     chart, ends = disk(), set()
-    for q in chart.domain.sample(12, 0):
+    for q in chart.domain.sample(12, 0)[::3]:
         if np.isfinite(chart.xi(q)).all():
             ranges = chart.xi_range(q)
             assert (ranges.low <= chart.xi(q)).all()
@@ -214,6 +216,25 @@ def test_fold_stops_a_coordinate() -> None:
     high = next(k for k in range(1, len(around)) if around[k + 1] < around[k])
     assert reach.high == pytest.approx(motion.xi[high, 0], abs=1e-3)  # a parabola at points 0.01 apart
     assert reach.high >= motion.xi[high, 0]
+
+
+@pytest.mark.parametrize("kind", ["torus", "box"])
+def test_extent_does_not_depend_on_the_points_of_the_curve(kind: str) -> None:
+    """Where xi turns back between points, the extent is that of a dense search around the largest and least point."""
+    robot = oc.Robot.planar([1.0] * LINKS, [3.0] * LINKS)
+    domain = oc.Torus(LINKS) if kind == "torus" else oc.Box([0.6, 0.8, 0.8], 2.2)
+    problem = oc.Problem(robot, oc.Task.position(robot, "xy"), domain=domain)
+    chart = oc.fit(problem, oc.Linear(base=(0.6, 0.8, 0.8))).chart
+    q = np.array([0.6, 0.8, 0.8])
+    rough, fine = (chart.self_motion(q, step=step) for step in (0.5, 1e-3))
+    assert isinstance(fine, SelfMotionCurve)
+    assert fine.folds > 0
+    for motion in (rough, fine):
+        # Points are 1e-3 apart, so the parabola through them rises by 1e-6 at most.
+        assert 0 <= motion.extent.high[0] - fine.xi.max() < 1e-6
+        assert 0 <= fine.xi.min() - motion.extent.low[0] < 1e-6
+    np.testing.assert_allclose(rough.extent.low, fine.extent.low, atol=1e-9)
+    np.testing.assert_allclose(rough.extent.high, fine.extent.high, atol=1e-9)
 
 
 def test_joint_limits_are_told_from_other_boundaries() -> None:

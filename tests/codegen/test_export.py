@@ -13,7 +13,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 import pytest
-from conftest import ROBOTS, robot_data
+from conftest import robot_of
 from programs import Run
 from public_objects import CHARTS, circle, fitted
 
@@ -57,11 +57,6 @@ def random_chart(robot: oc.Robot, task: oc.Task, parametrisation: Any, idle: tup
     size = parametrisation.family(space.restricted_to(active), r).size
     theta, offset, scale = rng.normal(size=size), rng.normal(size=r), rng.uniform(1, 2, r)
     return oc.Chart(problem, Coordinates(parametrisation, space, idle, theta, offset, scale))
-
-
-def robot_of(name: str) -> oc.Robot:
-    file, tip = ROBOTS[name]
-    return oc.Robot.from_urdf(robot_data(file), tip)
 
 
 def sliding(parametrisation: Any) -> oc.Chart:

@@ -115,6 +115,7 @@ def test_coupled_pd_plus_gives_the_wanted_acceleration(arm_chart: oc.Chart, mode
         np.testing.assert_allclose(J @ ddq + jacobian_rate(arm_chart, s.q, s.dq) @ s.dq, s.ddphi_d, atol=1e-6)
 
 
+@pytest.mark.slow
 def test_decoupled_law_relies_on_orthogonal_coordinates(planar_chart: oc.Chart, planar_x: oc.Problem) -> None:
     """At rest, with only dd_xi1 wanted: J_x ddq is 0 when coupled, and as small as the chart is good when decoupled."""
 

@@ -286,7 +286,7 @@ def test_the_fastest_mode_of_a_law_is_the_fastest_on_a_grid_of_its_domain(planar
 def test_users_search_for_modes_ends_where_the_brief_one_of_tests_does(
     planar_chart: oc.Chart, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """tests/conftest.py has laws search from a sixth of the postures."""
+    """tests/conftest.py has laws search from a twentieth of the postures."""
     brief = PDPlus(planar_chart, [200.0, 30.0, 5.0]).integral_bound
     monkeypatch.setattr(operational_space, "least_in_domain", point_quality.least_in_domain)
     assert PDPlus(planar_chart, [200.0, 30.0, 5.0]).integral_bound == pytest.approx(brief, rel=1e-3)

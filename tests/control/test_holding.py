@@ -10,6 +10,7 @@ import numpy as np
 import pinocchio as pin
 import pytest
 from conftest import Run, robot_data
+from programs import needs_c
 
 import orthocas as oc
 from orthocas.control import Impedance, PDPlus, Reference, RunTimeModel, Safety
@@ -131,6 +132,19 @@ def test_an_arm_that_sinks_within_its_domain_is_lost_too(planar_chart: oc.Chart,
     assert planar_chart.problem.domain.contains(run.q).all()
     assert run.outcome is Outcome.LOST
     assert run.reason.startswith("from t = 0 s to 0.3 s joint ")
+
+
+@pytest.mark.slow
+@needs_c
+def test_a_supervised_law_too_weak_for_the_arm_falls_into_its_catcher_and_is_lost(
+    planar_for_control: oc.Chart, planar_q0: Array
+) -> None:
+    limit = 0.6 * np.abs(planar_for_control.problem.robot.gravity(planar_q0))
+    law = quietly(PDPlus.on_chart, planar_for_control, limit=limit)
+    run = simulate(law, at_rest(planar_for_control, 0.5), planar_q0, control_rate=500.0, safety=Safety.of(law))
+    assert run.catches
+    assert run.outcome is Outcome.LOST
+    assert "joint 'q1' was at its limit" in run.reason
 
 
 @pytest.mark.nightly

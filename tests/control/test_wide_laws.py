@@ -42,8 +42,8 @@ def test_no_load_at_the_tip_makes_a_gradient_that_is_orthogonal_to_a_pose_lean()
 def test_decoupled_law_in_c_takes_a_wide_network_with_the_inertia_metric(tmp_path: Path) -> None:
     """Without a warning, which would be an error here."""
     known = oc.problems.get("planar_3r_xy")
-    family = oc.MLP((8, 8), raw=True)
-    chart = oc.fit_wide(known.robot, known.task, BENT, metric="inertia", parametrisation=family, samples=1000).chart
+    family = oc.MLP((8,), raw=True)
+    chart = oc.fit_wide(known.robot, known.task, BENT, metric="inertia", parametrisation=family, samples=600).chart
     law = PDPlus.on_chart(chart, coupling="decoupled")
     generated = oc.generate_c(chart, tmp_path, law, "arm")
     assert check_c(generated, chart, law, states=200).differences["control"] < 1e-10

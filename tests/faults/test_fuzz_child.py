@@ -52,6 +52,15 @@ def test_too_much_memory_is_a_finding_though_it_is_returned_or_refused() -> None
     assert found == {0: "takes 1.1 GiB", 1: "takes more than 2 GiB: damaged"}
 
 
+@pytest.mark.slow
+def test_too_much_time_is_a_finding() -> None:
+    """Of a loop in Python, and of a function that returns late; compiled code takes whole seconds (nightly)."""
+    found = {finding.seed: finding.what for finding in run("limits", _waste_time, range(2), seconds=0.2)}
+    assert set(found) == {0, 1}
+    assert re.fullmatch(r"takes more than 0.2 s|takes \d\.\d s", found[0])
+    assert re.fullmatch(r"takes \d\.\d s", found[1])
+
+
 @pytest.mark.nightly
 def test_too_much_time_is_a_finding_and_compiled_code_ends_too() -> None:
     found = {finding.seed: finding.what for finding in run("limits", _waste_time, range(4), seconds=0.3)}

@@ -9,6 +9,6 @@ from fuzz import signals
 
 @pytest.mark.slow
 def test_a_stopped_command_leaves_nothing_broken(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(signals, "KILLS", 2)
+    monkeypatch.setattr(signals, "KILLS", 1)
     what = signals.judge(list(signals.COMMANDS).index("fit"))
     assert what is None, what

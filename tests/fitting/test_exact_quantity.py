@@ -71,8 +71,8 @@ def wrapped(angles: Numbers) -> Numbers:
 @pytest.mark.parametrize(
     ("name", "kind"),
     [
-        *zip(ARMS, SEW_KINDS * 2, strict=True),
-        *nightly(*zip(ARMS, SEW_KINDS[::-1] * 2, strict=True)),
+        *tuple(zip(ARMS, SEW_KINDS * 2, strict=True))[1:3],
+        *nightly(*zip(ARMS, SEW_KINDS[::-1] * 2, strict=True), *tuple(zip(ARMS, SEW_KINDS * 2, strict=True))[::3]),
     ],
 )
 def test_xi_is_the_swivel_and_moves_it_by_what_is_asked(name: str, kind: SEWKind) -> None:
@@ -116,7 +116,11 @@ def test_values_of_angles_count_up_to_whole_turns() -> None:
         beyond = phi - np.append(np.zeros(6), 2 * np.pi * np.sign(phi[-1]))
         found = chart.solve(beyond[None])
         assert found.status[0] == oc.InverseStatus.FOUND
-        np.testing.assert_allclose(found.q[0], start, atol=1e-9)
+        # a pose may have several postures with this swivel
+        np.testing.assert_allclose(robot.tip_position(found.q[0]), robot.tip_position(start), atol=1e-9)
+        np.testing.assert_allclose(robot.tip_rotation(found.q[0]), robot.tip_rotation(start), atol=1e-9)
+        angles = swivels(robot, "conventional", np.array([found.q[0], start]))
+        assert wrapped(angles[0] - angles[1]) == pytest.approx(0.0, abs=1e-9)
         tracker = chart.tracker(start)
         for k in range(1, 6):
             tracker.step(phi + np.append(np.zeros(6), 0.02 * k * np.sign(phi[-1])))

@@ -31,6 +31,7 @@ def test_default_fit_of_the_iiwa_beats_the_papers_network(iiwa: oc.Problem) -> N
     assert abs(report.task_angle.mean - 90) < 0.5
 
 
+@pytest.mark.slow
 def test_idle_joint_is_split_off_as_an_exact_coordinate(iiwa_fit: Fit) -> None:
     assert iiwa_fit.idle_joints == ("A7",)
     chart = iiwa_fit.chart

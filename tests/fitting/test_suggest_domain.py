@@ -6,7 +6,7 @@ import json
 import casadi as ca
 import numpy as np
 import pytest
-from conftest import ROBOTS, robot_data
+from conftest import robot_of
 from programs import Run, nightly
 from public_objects import suggestion
 
@@ -26,11 +26,6 @@ HOME = (0.6, 0.8, 0.8)
 def planar() -> tuple[oc.Robot, oc.Task]:
     known = problems.get("planar_3r_xy")
     return known.robot, known.task
-
-
-def arm(name: str) -> oc.Robot:
-    file, tip = ROBOTS[name]
-    return oc.Robot.from_urdf(robot_data(file), tip)
 
 
 def suggested(**asked: object) -> object:
@@ -128,7 +123,7 @@ def test_joint_limits_end_the_box() -> None:
 
 
 def test_home_comes_from_the_files_or_is_a_bent_posture() -> None:
-    panda, xarm, ur10 = arm("panda"), arm("xarm7"), arm("ur10")
+    panda, xarm, ur10 = robot_of("panda"), robot_of("xarm7"), robot_of("ur10")
     assert "default" in find_home(panda, oc.Task.position(panda)).source
     for robot in (xarm, ur10):  # the postures of the xarm7 lie at limits, and the middle of the ur10 is stretched out
         home = find_home(robot, oc.Task.position(robot))
@@ -142,7 +137,7 @@ def test_home_comes_from_the_files_or_is_a_bent_posture() -> None:
 @pytest.mark.parametrize("metric", ["euclidean", "inertia"])
 def test_trial_charts_are_as_good_as_fits_of_their_degree(metric: str) -> None:
     """With Euclidean cosines, the loss of the other metric, the trial for A = M folds and leaks 1.5 times as much."""
-    robot = arm("ur10")
+    robot = robot_of("ur10")
     task = oc.Task.position(robot)
     box = oc.Box(find_home(robot, task).q, [0.5, *[0.25] * 5])
     problem = oc.Problem(robot, task, metric, box)
@@ -155,7 +150,7 @@ def test_trial_charts_are_as_good_as_fits_of_their_degree(metric: str) -> None:
 @pytest.mark.slow
 def test_bad_arguments_are_refused() -> None:
     robot, task = planar()
-    panda = arm("panda")
+    panda = robot_of("panda")
     position = oc.Task.position(panda)
     with pytest.raises(UnknownNameError, match="home 'nowhere'"):
         oc.suggest_domain(panda, position, "nowhere")
@@ -215,7 +210,7 @@ def test_progress_rises_to_the_end_of_the_search_and_waits_nowhere(joints: int) 
 @pytest.mark.slow
 def test_boxes_of_light_wrists_do_not_depend_on_the_luck_of_single_trials() -> None:
     """With a start of its own for every trial, the box of the ur10 with A = M had a mean half-width of 0.21 rad."""
-    robot = arm("ur10")
+    robot = robot_of("ur10")
     found = oc.suggest_domain(
         robot, oc.Task.position(robot), metric="inertia", parametrisation=oc.Polynomial(2, "auto")
     )

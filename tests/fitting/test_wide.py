@@ -314,9 +314,9 @@ def test_a_hand_that_rolls_moves_no_other_joint_and_closes_its_turns() -> None:
 
 @pytest.mark.slow
 def test_coordinates_without_the_roll_are_tried_first(tmp_path: Path) -> None:
-    fit = oc.fit_wide(iiwa(), oc.Task.pose(iiwa()), home_branch(), samples=4000)
-    assert fit.chart.coordinates.label == "polynomial:6:cyclic=A1:without=A7"
-    assert fit.regular_share > 0.999
+    fit = oc.fit_wide(iiwa(), oc.Task.pose(iiwa()), home_branch(), samples=10_000)
+    assert fit.chart.coordinates.label == "mlp:24x24x24:raw:without=A7"
+    assert fit.regular_share > 0.998
     fit.chart.save(tmp_path / "wide.orthocas")
     q = sample_uniform(fit.chart.problem.domain, 50, 1)
     np.testing.assert_array_equal(oc.load(tmp_path / "wide.orthocas").xi(q), fit.chart.xi(q))
@@ -325,17 +325,44 @@ def test_coordinates_without_the_roll_are_tried_first(tmp_path: Path) -> None:
 
 
 def test_the_first_families_leave_out_the_turn_of_the_tool_and_of_a_base_that_turns_fully() -> None:
-    """In the inertia metric networks come first; the base of the iiwa has limits, that of the other arm has none."""
+    """One coordinate is a network, a swivel a polynomial; the base of the iiwa has limits, the other one has none."""
     endless = oc.Robot.from_urdf(Path(__file__).parents[1] / "data" / "robots" / "four_endless_joints.urdf")
-    for robot, metric, expected in (
-        (iiwa(), "euclidean", ["polynomial:6:cyclic=A1:without=A7"]),
-        (iiwa(), "inertia", ["mlp:24x24x24:raw:cyclic=A1:without=A7", "polynomial:6:cyclic=A1:without=A7"]),
-        (endless, "euclidean", ["polynomial:6:without=j1,j7", "polynomial:6:cyclic=j1:without=j7"]),
+    for robot, metric, like, expected in (
+        (iiwa(), "euclidean", None, ["mlp:24x24x24:raw:without=A7"]),
+        (iiwa(), "inertia", None, ["mlp:24x24x24:raw:without=A7"]),
+        (iiwa(), "euclidean", "swivel", ["polynomial:6:cyclic=A1:without=A7"]),
+        (endless, "euclidean", None, ["mlp:24x24x24:raw:without=j1,j7", "mlp:24x24x24:raw:cyclic=j1:without=j7"]),
     ):
         task = oc.Task.pose(robot)
         problem = oc.Problem(robot, task, metric, regular_box(robot, task))
-        labels = [family.label for family in wide_fits._choose_families(problem, None)]
+        labels = [family.label for family in wide_fits._choose_families(problem, like)]
         assert [label for label in labels if "without" in label] == expected
+
+
+@pytest.mark.parametrize("metric", ["euclidean", "inertia"])
+@pytest.mark.parametrize("without", [("A7",), ("A1", "A7")])
+def test_no_gradient_without_some_joints_is_nearer_to_the_self_motion_than_the_bound(
+    metric: Any, without: tuple[str, ...]
+) -> None:
+    """The nearest one is found again by least squares, from a null vector of a Jacobian by differences.
+
+    Self-motions leave the last link at rest, so it has no momentum: in the inertia metric its turn costs nothing.
+    """
+    task = oc.Task.pose(iiwa())
+    problem = oc.Problem(iiwa(), task, metric, regular_box(iiwa(), task))
+    points = sample_uniform(problem.domain, 2000, (0, wide_fits.RULES.bounded_tag))
+    kept, leaks = [k for k, name in enumerate(iiwa().joint_names) if name not in without], []
+    for q, z in zip(points, self_motions(iiwa(), points), strict=True):
+        # with A = L L^T, the leak is the angle between L^-1 v and L^T z
+        L = np.linalg.cholesky(iiwa().mass_matrix(q) if metric == "inertia" else np.eye(7))
+        wanted = L.T @ z
+        basis = np.linalg.inv(L)[:, kept]
+        rest = wanted - basis @ np.linalg.lstsq(basis, wanted, rcond=None)[0]
+        leaks.append(np.arcsin(np.linalg.norm(rest) / np.linalg.norm(wanted)))
+    found = wide_fits._bound_leak(problem, without, 0)
+    assert found == pytest.approx(np.degrees(np.sqrt(np.mean(np.square(leaks)))), rel=1e-6, abs=1e-6)
+    assert found < 1e-6 if (metric, len(without)) == ("inertia", 1) else found > 5
+    assert wide_fits._bound_leak(problem, (), 0) == 0
 
 
 def planar_values(robot: oc.Robot, q: Numbers) -> Numbers:

@@ -34,6 +34,8 @@ LOADERS = {
     "run_module",
     "run_path",
     "find_spec",
+    "spec_from_file_location",
+    "reload",
     "exec",
     "eval",
 }
@@ -65,19 +67,18 @@ def naming(node: ast.AST) -> tuple[ast.AST, ...]:
 
 
 @cache
-def imports_of(path: Path, inside: bool = False, types: bool = False, named: bool = True) -> frozenset[str]:
+def imports_of(path: Path, inside: bool = False, types: bool = False) -> frozenset[str]:
     """Modules of this package that a file takes names from, itself excluded; see `imports_in`."""
-    return frozenset(name for name in imports_in(tree(path), inside, types, named) if MODULES[name] != path)
+    return frozenset(name for name in imports_in(tree(path), inside, types) if MODULES[name] != path)
 
 
-def imports_in(source: ast.Module, inside: bool = False, types: bool = False, named: bool = True) -> set[str]:
+def imports_in(source: ast.Module, inside: bool = False, types: bool = False) -> set[str]:
     """Modules of this package that a text takes names from; names that a package hands on count where they are made.
 
     Args:
         source: the text.
-        inside: also imports in functions.
+        inside: also imports in functions, and modules that are named by strings.
         types: also imports that only types need.
-        named: with `inside`, also modules that are named by strings.
     """
     found = set()
     for node in nodes(source, inside, types):
@@ -86,7 +87,7 @@ def imports_in(source: ast.Module, inside: bool = False, types: bool = False, na
             found |= {home(node.module or "", alias.name) for alias in node.names}
         elif isinstance(node, ast.Import):
             found |= {alias.name for alias in node.names}
-        elif inside and named and isinstance(node, ast.Constant) and isinstance(node.value, str) and "." in node.value:
+        elif inside and isinstance(node, ast.Constant) and isinstance(node.value, str) and "." in node.value:
             found.add(node.value.partition(":")[0])
     return {name for name in found if name in MODULES}
 
@@ -95,6 +96,8 @@ def nodes(source: ast.Module, inside: bool, types: bool) -> Iterator[ast.AST]:
     for node in source.body:
         if isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING":
             yield from node.body if types else ()
+            # What runs in place of the imports for types.
+            yield from (part for other in node.orelse for part in (naming(other) if inside else (other,)))
         elif inside:
             yield from naming(node)
         else:
@@ -103,15 +106,26 @@ def nodes(source: ast.Module, inside: bool, types: bool) -> Iterator[ast.AST]:
 
 def takes_from_the_face(source: ast.Module) -> bool:
     """Whether a text imports `orthocas` itself, through which it could reach every package, or a public name of it."""
+    taken = False
     for node in every(source):
         if isinstance(node, ast.ImportFrom) and node.module == "orthocas":
-            if any(home("orthocas", alias.name) == "orthocas" for alias in node.names):
-                return True
+            taken |= any(home("orthocas", alias.name) == "orthocas" for alias in node.names)
         elif isinstance(node, ast.Import):
             whole = [alias.name for alias in node.names if alias.asname is None or alias.name == "orthocas"]
-            if any(name.partition(".")[0] == "orthocas" for name in whole):
-                return True
-    return False
+            taken |= any(name.partition(".")[0] == "orthocas" for name in whole)
+        # The same by a string: import_module("orthocas"), sys.modules["orthocas"], sys.modules.get(name).
+        elif isinstance(node, ast.Subscript):
+            taken |= last_name(node.value) == "modules"
+        elif isinstance(node, ast.Call) and (
+            last_name(node.func) in LOADERS or last_name(getattr(node.func, "value", node)) == "modules"
+        ):
+            taken |= any(isinstance(part, ast.Constant) and part.value == "orthocas" for part in node.args)
+    return taken
+
+
+def last_name(node: ast.AST) -> str:
+    """`c` of a.b.c."""
+    return node.id if isinstance(node, ast.Name) else node.attr if isinstance(node, ast.Attribute) else ""
 
 
 def computes_names(source: ast.Module) -> bool:
@@ -126,11 +140,7 @@ def computes_names(source: ast.Module) -> bool:
         and isinstance(node.args[0], ast.Constant)
         and isinstance(node.args[0].value, str)
     }
-    for node in every(source):
-        name = node.id if isinstance(node, ast.Name) else node.attr if isinstance(node, ast.Attribute) else ""
-        if name in loaders and node not in written_out:
-            return True
-    return False
+    return any(last_name(node) in loaders and node not in written_out for node in every(source))
 
 
 @cache
@@ -176,8 +186,8 @@ def test_there_are_sources_to_check() -> None:
 
 @pytest.mark.slow
 def test_files_import_in_no_circle() -> None:
-    """Imports in functions count, too; those that only types need do not."""
-    assert circle({name: imports_of(path, inside=True, named=False) for name, path in MODULES.items()}) == []
+    """Imports in functions and by strings count, too; those that only types need do not."""
+    assert circle({name: imports_of(path, inside=True) for name, path in MODULES.items()}) == []
     assert circle({"a": {"b"}, "b": {"c"}, "c": {"b"}}) == ["b", "c", "b"]
 
 
@@ -186,7 +196,13 @@ def test_no_file_takes_names_from_the_face() -> None:
     assert [name for name, path in SOURCES.items() if takes_from_the_face(tree(path))] == []
 
 
-@pytest.mark.parametrize("text", ["import orthocas as oc", "import orthocas.charts.chart", "from orthocas import fit"])
+@pytest.mark.parametrize(
+    "text",
+    [
+        *("import orthocas as oc", "import orthocas.charts.chart", "from orthocas import fit"),
+        *("import_module('orthocas')", "sys.modules['orthocas'].fit", "sys.modules.get('orthocas')"),
+    ],
+)
 def test_names_from_the_face_are_found(text: str) -> None:
     assert takes_from_the_face(ast.parse(f"def late():\n    {text}"))
     assert not takes_from_the_face(ast.parse("from orthocas import problems\nimport orthocas.charts.chart as chart"))
@@ -263,6 +279,12 @@ def test_computed_names_of_modules_are_found(text: str) -> None:
     written_out = ast.parse("def late():\n    return import_module('orthocas.cli.fit')")
     assert not computes_names(written_out)
     assert imports_in(written_out, inside=True) == {"orthocas.cli.fit"}
+
+
+def test_what_runs_in_place_of_imports_for_types_counts() -> None:
+    text = ast.parse("if TYPE_CHECKING:\n    import orthocas.cli.fit\nelse:\n    from orthocas.charts import chart")
+    assert imports_in(text) == imports_in(text, inside=True) == {"orthocas.charts.chart"}
+    assert imports_in(text, inside=True, types=True) == {"orthocas.cli.fit", "orthocas.charts.chart"}
 
 
 def test_entry_points_lead_to_the_top() -> None:

@@ -15,6 +15,7 @@ from solid_arms import BALL, build_arm, place_balls
 import orthocas as oc
 from orthocas.errors import InvalidValueError, PathError, RobotError, UnknownNameError
 from orthocas.robots.collisions import Collisions
+from orthocas.robots.shapes import HullGeometry
 from orthocas.tasks.domains import StopKind
 from orthocas.tools.checks import Array
 
@@ -455,3 +456,28 @@ def test_a_box_in_both_hands_moves_with_them_and_hits_what_is_around(tmp_path: P
     contact = Collisions(around.tree, around.parts, [("carton", "wall")]).find_contact(np.linspace(q, moved, 20))
     assert contact is not None
     assert contact.segment > 15
+
+
+def test_discs_of_many_corners_are_solids_with_the_distances_of_a_prism() -> None:
+    """coal counts up to 255 neighbours of a corner; Qhull would give one corner of each face 598."""
+    turns = np.linspace(0, 2 * np.pi, 600, endpoint=False)
+    ring = np.column_stack([np.cos(turns), np.sin(turns)])
+    disc = HullGeometry.around(np.vstack([np.column_stack([ring, np.full(600, z)]) for z in (-0.1, 0.1)]))
+    assert len(disc.points) == 1200
+    assert np.bincount(disc.faces.ravel()).max() < 40
+    # the faces close: as many edges, two sides each, as Euler's formula asks for
+    edges = np.sort(np.vstack([disc.faces[:, [0, 1]], disc.faces[:, [1, 2]], disc.faces[:, [2, 0]]]), axis=1)
+    assert set(np.unique(edges, axis=0, return_counts=True)[1]) == {2}
+    assert len(disc.points) - len(edges) / 2 + len(disc.faces) == 2
+    built, ball = disc.build(), coal.Sphere(0.2)
+    for place, expected in [((0.3, 0.2, 1.0), 0.7), ((2.0, 0.0, 0.05), 0.8), ((0.0, -3.0, 0.0), 1.8)]:
+        answer = coal.DistanceResult()
+        coal.distance(
+            built,
+            coal.Transform3s(),
+            ball,
+            coal.Transform3s(np.eye(3), np.array(place)),
+            coal.DistanceRequest(),
+            answer,
+        )
+        assert answer.min_distance == pytest.approx(expected, abs=1e-5)

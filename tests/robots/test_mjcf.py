@@ -426,6 +426,14 @@ def test_a_joint_that_follows_a_locked_one_keeps_its_place(tmp_path: Path) -> No
     assert_close(robot.tip_rotation([0.1, 0.7]), free.tip_rotation([0.1, 0.7, 0.3, 0.3 - ref]))
 
 
+def test_two_couplings_of_one_joint_are_refused(tmp_path: Path) -> None:
+    path, second = tmp_path / "twice.xml", '<joint joint1="c" joint2="a" polycoef="0 1 0 0 0"/></equality>'
+    path.write_text(COUPLED.format(coefficients="0 1 0 0 0", active="true").replace("</equality>", second))
+    with pytest.raises(RobotError, match="'c' is coupled to 'b' and, otherwise, to 'a', .* lock it with locked="):
+        oc.Robot.from_mjcf(path, "four")
+    assert oc.Robot.from_mjcf(path, "four", {"c": 0.3}).joint_names == ("a", "b", "d")
+
+
 @pytest.mark.parametrize(("coefficients", "active"), [("0 1 0.2 0 0", "true"), ("0 1 0 0 0", "false")])
 def test_other_equalities_leave_joints_free(coefficients: str, active: str, tmp_path: Path) -> None:
     path = tmp_path / "free.xml"

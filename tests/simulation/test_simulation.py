@@ -25,6 +25,7 @@ from orthocas.simulation import (
 from orthocas.tools.checks import Array
 
 
+@pytest.mark.slow
 def test_run_agrees_with_another_integrator_on_pinocchios_dynamics(
     planar_chart: oc.Chart, planar_steps: Reference, planar_q0: Array
 ) -> None:

@@ -12,6 +12,20 @@ from orthocas.simulation import Friction, StickingPlant
 pytestmark = needs_c
 
 
+@pytest.mark.slow
+def test_a_planar_arm_that_sticks_reaches_x_and_xi(
+    planar_for_control: oc.Chart, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Joints rub with 3 N m, a quarter more to break away; stiff springs bear it, and nothing is caught."""
+    monkeypatch.setattr(sticking, "WAY", 0.1)
+    law = PDPlus.on_chart(planar_for_control, limit=120.0)
+    plant = StickingPlant(law.problem.robot, friction=Friction(0.0, 3.0, 3.75))
+    with sticking.supervised(law) as supervisor:
+        x, xi, _ = sticking.lead(law, supervisor, plant, law.problem.domain.centre, 1.5)
+    assert x < 0.5
+    assert xi < 0.02
+
+
 @pytest.mark.nightly
 def test_an_arm_that_sticks_reaches_x_and_xi_and_is_not_caught() -> None:
     """A bare wrist jumps beyond its limit of speed as it breaks away, and the arm stands still under torques."""

@@ -378,6 +378,21 @@ def test_joints_that_turn_without_end_may_report_any_number_of_whole_turns(
     assert np.abs(commands[0] - supervised_law.problem.robot.gravity(q)).max() > 1.0
 
 
+@pytest.mark.parametrize("period", [0.01, 0.02])
+def test_slow_programs_may_lose_one_measurement_and_not_two(
+    supervised_library: CompiledLibrary, supervised_law: Controller, planar_for_control: oc.Chart, period: float
+) -> None:
+    """A tick of 10 or 20 ms is as long as measurements may be missing at 1 kHz."""
+    chart, q = planar_for_control, planar_for_control.problem.domain.centre - np.array([0.0, 0.0, 0.15])
+    supervisor = Supervisor(supervised_library, supervised_law, Safety.of(supervised_law))
+    supervisor.take_over(q, chart.problem.robot.gravity(q))
+    target, at_place, lost = at_rest(chart, q), (q, np.zeros(3)), (np.full(3, np.nan), np.zeros(3))
+    for measured, mode in [(at_place, 0), (lost, 0), (at_place, 0), (at_place, 0), (lost, 0), (lost, 1), (at_place, 1)]:
+        _, status = supervisor.step(*measured, target, period)
+        assert (status == ControlStatus.BAD_INPUT) == (measured is lost)
+        assert supervisor.mode == mode
+
+
 def test_slow_programs_see_no_more_acceleration_than_there_is(
     supervised_library: CompiledLibrary, supervised_law: Controller, planar_for_control: oc.Chart
 ) -> None:

@@ -22,7 +22,16 @@ def test_task_without_redundancy_is_refused() -> None:
 
 def test_task_of_another_robot_is_refused() -> None:
     with pytest.raises(InvalidValueError, match="another robot"):
-        oc.Problem(arm(), oc.Task.position(arm(), "x"))
+        oc.Problem(arm(), oc.Task.position(arm(4), "x"))
+    longer = oc.Robot.planar(lengths=[2.0, 1.0, 1.0], masses=[3.0, 3.0, 3.0])
+    with pytest.raises(InvalidValueError, match="another robot"):
+        oc.Problem(arm(), oc.Task.position(longer, "x"))
+
+
+def test_robot_may_be_built_twice() -> None:
+    problem = oc.Problem(arm(), oc.Task.position(arm(), "xy"))
+    assert (problem.n, problem.m) == (3, 2)
+    assert oc.Task.stack(oc.Task.position(arm(), "x"), oc.Task.position(arm(), "y")).m == 2
 
 
 def test_singular_samples_are_counted_and_located() -> None:

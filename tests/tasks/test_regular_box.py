@@ -3,7 +3,7 @@
 import casadi as ca
 import numpy as np
 import pytest
-from conftest import ROBOTS, robot_data
+from conftest import robot_of
 
 import orthocas as oc
 from orthocas.problems import iiwa_robot
@@ -11,14 +11,9 @@ from orthocas.tasks.domains import default_box, require_within_limits
 from orthocas.tasks.regular_box import regular_box
 
 
-def arm(name: str) -> oc.Robot:
-    file, tip = ROBOTS[name]
-    return oc.Robot.from_urdf(robot_data(file), tip)
-
-
 @pytest.mark.parametrize(("name", "kind"), [("panda", "position"), ("panda", "pose"), ("ur10", "position")])
 def test_middle_of_the_limits_stays_where_the_task_is_regular(name: str, kind: str) -> None:
-    robot = arm(name)
+    robot = robot_of(name)
     box, middle = regular_box(robot, oc.Task.named(robot, kind)), default_box(robot)
     np.testing.assert_array_equal(box.centre, middle.centre)
     np.testing.assert_array_equal(box.half_width, middle.half_width)
@@ -37,7 +32,7 @@ def test_middle_of_the_limits_stays_where_the_task_is_regular(name: str, kind: s
 )
 def test_singular_middle_is_left_for_a_bent_posture_inside_the_limits(name: str, kind: str) -> None:
     """The independent judge is `check`, on other samples than the choice used."""
-    robot = iiwa_robot() if name == "iiwa" else arm(name)
+    robot = iiwa_robot() if name == "iiwa" else robot_of(name)
     task = oc.Task.named(robot, kind)
     problem, middle = oc.Problem(robot, task), default_box(robot)
     require_within_limits(robot, problem.domain)

@@ -729,7 +729,7 @@ static int plausible(const orthocas_arm *arm, const orthocas_state *state, const
   const double since = period * (1.0 + (double)state->bad_ticks / (double)later(0, period));
   int i, odd = faster_than(arm, dq, safety->speed_limit, rules.implausible);
   for (i = 0; i < arm->n; ++i)
-    if (state->bad_ticks < safety->hold_ticks &&
+    if ((state->bad_ticks < safety->hold_ticks || state->bad_ticks <= later(0, period)) &&
         fabs(between(arm, i, unturned(arm, state, i, q[i]) - state->q[i])) >
             rules.implausible * safety->speed_limit[i] * since + rules.jitter)
       odd = 1;
@@ -1406,7 +1406,7 @@ ORTHOCAS_API int orthocas_step(const orthocas_arm *arm, orthocas_state *state, i
     return ORTHOCAS_BAD_INPUT;
   }
   for (i = 0; i < n; ++i) here[i] = unturned(arm, state, i, q[i]);
-  if (state->bad_ticks >= safety->hold_ticks) {
+  if (state->bad_ticks >= safety->hold_ticks && state->bad_ticks > later(0, since)) { /* not after one slow tick */
     if (state->mode == ORTHOCAS_LAW) catch_arm(arm, state, ORTHOCAS_BAD_INPUT, here);
     copy(state->anchor, here, n);
     take_command(arm, state, 0);
