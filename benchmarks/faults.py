@@ -35,7 +35,7 @@ from numpy.typing import ArrayLike
 import orthocas as oc
 from orthocas.codegen import CompiledLibrary, Supervisor, compile_shared
 from orthocas.control import ControlStatus, PDPlus, Safety
-from orthocas.simulation import MuJoCoPlant
+from orthocas.simulation import Friction, MuJoCoPlant
 from orthocas.tools.checks import Array
 
 ARMS = ("iiwa7-position", "panda-position", "xarm7-position", "tiago-pro-left-position", "panda-pose")
@@ -68,6 +68,7 @@ class Arm:
     rng: np.random.Generator
     bits: int = 0  #: of the encoders, a turn; 0: no rounding
     before: Array | None = None  #: what they measured last
+    friction: Friction | None = None  #: of the joints, beside what the settings take for possible
 
     @property
     def robot(self) -> oc.Robot:
@@ -94,7 +95,7 @@ class Arm:
     def started(self, q: Array, robot: oc.Robot | None = None, **settings: Any) -> tuple[Supervisor, MuJoCoPlant]:
         """The law and its arm at rest at q (n,)."""
         supervisor = Supervisor(self.library, self.law, replace(self.safety, **settings))
-        plant = MuJoCoPlant(robot := self.robot if robot is None else robot)
+        plant = MuJoCoPlant(robot := self.robot if robot is None else robot, friction=self.friction)
         plant.reset(q)
         # With the torque that holds it, as programs start: a lift with unknown loads sinks faster than its limit.
         supervisor.start(q, robot.gravity(q))

@@ -49,7 +49,7 @@ class SafetyRules:
     stuck_speed: float = 0.15  #: that commands must have given to an arm that measures the same [rad/s]
     stuck: float = 0.25  #: and at most this share of the speed limit
     stuck_way: float = 0.03  #: likewise of velocity laws [rad]
-    friction: float = 2.0  #: that may hold a joint at a start beside its torque [N m] or [N]
+    friction: float = 2.0  #: that may hold any joint at a start, and later one without a limit of effort [N m] or [N]
     most_friction: float = 12.5  #: and most that may hold it against the law, later [N m] or [N]
     stiction: float = 0.125  #: the same as a share of the effort limit: Coulomb friction of 10 %, a quarter more
     fine_step: float = 2 * np.pi / 2**13  #: of an encoder [rad]
@@ -180,6 +180,8 @@ class Safety:
         speed_limit = np.where(np.isfinite(robot.velocity_limits), robot.velocity_limits, RULES.speed)
         slow = np.minimum(RULES.return_speed, speed_limit / 3)
         efforts = np.where(np.isfinite(robot.effort_limits), robot.effort_limits, gravity)
+        # Joints without a limit of effort may stick too, and on vertical axes no gravity says how much.
+        stiction = np.where(np.isfinite(robot.effort_limits), 0.0, RULES.friction)
         # Motors of sliding joints have the force of many newtons, and give it as soon as others their torque.
         sliding = np.where(
             robot.tree.prismatic & np.isfinite(robot.effort_limits), robot.effort_limits / RULES.full_force, 0.0
@@ -208,7 +210,7 @@ class Safety:
             "longest_period": 0.02,
             "observer_rate": np.zeros(n),
             "encoder_step": np.zeros(n),
-            "friction": np.minimum(RULES.most_friction, RULES.stiction * efforts),
+            "friction": np.clip(RULES.stiction * efforts, stiction, RULES.most_friction),
             "lower": robot.lower,
             "upper": robot.upper,
             "stop_zone": np.fmin(RULES.zone, RULES.zone * (robot.upper - robot.lower)),

@@ -52,3 +52,11 @@ def test_friction_that_may_hold_a_joint_is_a_share_of_its_effort_limit() -> None
     law = PDPlus(oc.load("panda-position"))
     limits = law.chart.problem.robot.effort_limits
     np.testing.assert_allclose(Safety.of(law).friction, np.minimum(12.5, 0.125 * limits))
+
+
+def test_joints_without_a_limit_of_effort_may_stick_on_vertical_axes_too() -> None:
+    """There is no gravity that would say how much holds them."""
+    robot = oc.Robot.planar([0.4, 0.3, 0.2], [2.0, 1.0, 0.5])
+    chart = oc.fit(oc.Problem(robot, oc.Task.position(robot, "xy"), domain=oc.Box([0.3, 0.8, 0.8], 0.3))).chart
+    assert np.isinf(robot.effort_limits).all()
+    np.testing.assert_allclose(Safety.of(PDPlus(chart, 50.0, limit=90.0)).friction, 2.0)

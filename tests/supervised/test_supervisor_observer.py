@@ -111,3 +111,25 @@ def test_the_catcher_of_a_fast_arm_damps_what_is_observed(observed: Supervisor, 
     assert status is ControlStatus.CAUGHT
     np.testing.assert_allclose(observed.dq, speed, atol=0.25)
     assert np.abs(np.diff(commands[700:], axis=0)).max() < 1.0
+
+
+def test_of_an_arm_that_nobody_sees_it_foresees_what_torques_do_once(
+    observed: Supervisor, planar_for_control: oc.Chart
+) -> None:
+    """Sensors stand still as joints speed up: the speeds that the catcher brakes are those of the arm, within 10 %."""
+    chart, robot, dq = planar_for_control, planar_for_control.problem.robot, np.zeros(3)
+    q = chart.problem.domain.centre
+    observed.start(q)
+    reference, seen = at_rest(chart, q), (q, dq)
+    for k in range(60):
+        reference[0] += 0.1 * (k == 40)
+        if k < 44:
+            seen = q, dq
+        command, status = observed.step(*seen, reference, TICK)
+        if observed.mode == 1 and k > 44:
+            break
+        dq = dq + TICK * robot.forward_dynamics(q, dq, command)
+        q = q + TICK * dq
+    assert status is ControlStatus.BAD_INPUT
+    assert np.abs(dq).max() > 0.05
+    np.testing.assert_allclose(observed.dq, dq, atol=0.1 * np.abs(dq).max())

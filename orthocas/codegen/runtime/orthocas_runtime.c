@@ -57,15 +57,15 @@ static const struct {
 
 /* ---- numbers ---- */
 
-static int all_within(const double *x, int count, double bound) {
+static int all_from(double least, const double *x, int count, double most) {
   int i;
   for (i = 0; i < count; ++i)
-    if (!(fabs(x[i]) <= bound)) return 0; /* false for NaN */
+    if (!(x[i] >= least && x[i] <= most)) return 0; /* false for NaN */
   return 1;
 }
 
 static int all_finite(const orthocas_arm *arm, const double *x, int count) {
-  return all_within(x, count, arm->numbers.largest);
+  return all_from(-arm->numbers.largest, x, count, arm->numbers.largest);
 }
 
 static void set_zero(double *x, int count) {
@@ -138,47 +138,34 @@ static int inside(const orthocas_arm *arm, const double *q) {
 }
 
 ORTHOCAS_API int orthocas_chart(const orthocas_arm *arm, const double *q, double *phi, double *jacobian) {
-  const int n = arm->n;
+  const int n = arm->n, finite = all_finite(arm, q, n);
+  if (finite) arm->kernels.chart(q, phi, jacobian);
+  if (finite && all_finite(arm, phi, n) && all_finite(arm, jacobian, n * n))
+    return inside(arm, q) ? ORTHOCAS_OK : ORTHOCAS_OUTSIDE_DOMAIN;
   set_zero(phi, n);
   set_zero(jacobian, n * n);
-  if (!all_finite(arm, q, n)) return ORTHOCAS_NOT_FINITE;
-  arm->kernels.chart(q, phi, jacobian);
-  if (!all_finite(arm, phi, n) || !all_finite(arm, jacobian, n * n)) { /* the task is undefined at q */
-    set_zero(phi, n);
-    set_zero(jacobian, n * n);
-    return ORTHOCAS_SINGULAR;
-  }
-  return inside(arm, q) ? ORTHOCAS_OK : ORTHOCAS_OUTSIDE_DOMAIN;
+  return finite ? ORTHOCAS_SINGULAR : ORTHOCAS_NOT_FINITE; /* the task is undefined at q */
 }
 
 ORTHOCAS_API int orthocas_curvature(const orthocas_arm *arm, const double *q, const double *dq, const double *v,
                                     double *curvature) {
-  const int n = arm->n;
+  const int n = arm->n, finite = all_finite(arm, q, n) && all_finite(arm, dq, n) && all_finite(arm, v, n);
+  if (finite) arm->kernels.curvature(q, dq, v, curvature);
+  if (finite && all_finite(arm, curvature, n)) return inside(arm, q) ? ORTHOCAS_OK : ORTHOCAS_OUTSIDE_DOMAIN;
   set_zero(curvature, n);
-  if (!all_finite(arm, q, n) || !all_finite(arm, dq, n) || !all_finite(arm, v, n)) return ORTHOCAS_NOT_FINITE;
-  arm->kernels.curvature(q, dq, v, curvature);
-  if (!all_finite(arm, curvature, n)) { /* the task is undefined at q, or a square overflows */
-    set_zero(curvature, n);
-    return ORTHOCAS_SINGULAR;
-  }
-  return inside(arm, q) ? ORTHOCAS_OK : ORTHOCAS_OUTSIDE_DOMAIN;
+  return finite ? ORTHOCAS_SINGULAR : ORTHOCAS_NOT_FINITE; /* the task is undefined at q, or a square overflows */
 }
 
 ORTHOCAS_API int orthocas_dynamics(const orthocas_arm *arm, const double *q, const double *dq, double *mass_matrix,
                                    double *bias, double *gravity) {
-  const int n = arm->n;
-  set_zero(mass_matrix, n * n);
+  const int n = arm->n, finite = all_finite(arm, q, n) && all_finite(arm, dq, n);
+  if (finite) arm->kernels.dynamics(q, dq, mass_matrix, bias, gravity);
+  if (finite && all_finite(arm, mass_matrix, n * n) && all_finite(arm, bias, n) && all_finite(arm, gravity, n))
+    return inside(arm, q) ? ORTHOCAS_OK : ORTHOCAS_OUTSIDE_DOMAIN;
+  set_zero(mass_matrix, n * n); /* squares of high speeds overflow */
   set_zero(bias, n);
   set_zero(gravity, n);
-  if (!all_finite(arm, q, n) || !all_finite(arm, dq, n)) return ORTHOCAS_NOT_FINITE;
-  arm->kernels.dynamics(q, dq, mass_matrix, bias, gravity);
-  if (!all_finite(arm, mass_matrix, n * n) || !all_finite(arm, bias, n) || !all_finite(arm, gravity, n)) {
-    set_zero(mass_matrix, n * n); /* overflow at high speeds */
-    set_zero(bias, n);
-    set_zero(gravity, n);
-    return ORTHOCAS_NOT_FINITE;
-  }
-  return inside(arm, q) ? ORTHOCAS_OK : ORTHOCAS_OUTSIDE_DOMAIN;
+  return ORTHOCAS_NOT_FINITE;
 }
 
 /* ---- the inverse map ---- */
@@ -507,6 +494,10 @@ ORTHOCAS_API int orthocas_control(const orthocas_arm *arm, const double *q, cons
 
 static double clipped(double x, double bound) { return fmin(fmax(x, -bound), bound); }
 
+static int is_position(const orthocas_arm *arm, const double *q) {
+  return all_from(-arm->numbers.farthest, q, arm->n, arm->numbers.farthest);
+}
+
 /* A difference of two positions of joint i. */
 static double between(const orthocas_arm *arm, int i, double difference) {
   return arm->turning[i] ? difference - rules.turn * floor(difference / rules.turn + 0.5) : difference;
@@ -547,13 +538,6 @@ static void fallback_at(const orthocas_arm *arm, const double *q, const void *ga
   arm->kernels.fallback(q, gains, command);
   for (i = 0; i < arm->n; ++i)
     if (!(fabs(command[i]) <= arm->numbers.largest)) command[i] = 0.0;
-}
-
-static int all_from(double least, const double *x, int count, double most) {
-  int i;
-  for (i = 0; i < count; ++i)
-    if (!(x[i] >= least && x[i] <= most)) return 0; /* false for NaN */
-  return 1;
 }
 
 static int is_positive(const orthocas_arm *arm, double x) { return x > 0.0 && x <= arm->numbers.largest; }
@@ -703,10 +687,6 @@ static int faster_than(const orthocas_arm *arm, const double *dq, const double *
   return fast;
 }
 
-static int is_measurement(const orthocas_arm *arm, const double *q, const double *dq) {
-  return all_within(q, arm->n, arm->numbers.farthest) && all_finite(arm, dq, arm->n);
-}
-
 /* Whether the joints moved as the speeds say since the last finite measurement: then even great speeds are true. */
 static int moved_as_told(const orthocas_arm *arm, const orthocas_state *state, const double *q, const double *dq) {
   int i;
@@ -756,7 +736,7 @@ static int look(const orthocas_arm *arm, orthocas_state *state, const double *q,
                 double *work) {
   const int n = arm->n;
   int i, same = 1, good;
-  if (!is_measurement(arm, q, dq)) return 0;
+  if (!is_position(arm, q) || !all_finite(arm, dq, n)) return 0;
   good = plausible(arm, state, q, dq, period);
   for (i = 0; i < n; ++i) same = same && fabs(q[i] - state->seen_q[i]) <= 0.0 && fabs(dq[i] - state->seen_dq[i]) <= 0.0;
   copy(state->seen_q, q, n);
@@ -1101,11 +1081,6 @@ static void learn_load(const orthocas_arm *arm, orthocas_state *state, const dou
   copy(state->speed, dq, arm->n);
 }
 
-static void add_load(const orthocas_arm *arm, const orthocas_state *state, double share, double *command) {
-  int i;
-  for (i = 0; i < arm->n; ++i) command[i] += share * state->load[i];
-}
-
 /* Torque = fallback + load + weight (law - fallback - load) + M (stops - damping dq) - spring of the catcher. M, bias,
  * gravity: of the arm at q and dq. R21: damping grows towards the boundary, and as the law gives way. */
 static void compose_torque(const orthocas_arm *arm, orthocas_state *state, const double *q, const double *dq, double room,
@@ -1124,8 +1099,8 @@ static void compose_torque(const orthocas_arm *arm, orthocas_state *state, const
     double moved = 0.0;
     for (j = 0; j < arm->n; ++j) moved += M[i * arm->n + j] * wanted[j];
     command[i] = fallback[i] + state->weight * state->law[i] + moved - spring[i];
+    command[i] += (1.0 - state->weight) * state->load[i];
   }
-  add_load(arm, state, 1.0 - state->weight, command);
 }
 
 /* Velocity = weight times the law + way to the anchor, not faster towards a joint limit than its distance allows (R19). */
@@ -1247,7 +1222,7 @@ ORTHOCAS_API int orthocas_check_start(const orthocas_arm *arm, const orthocas_sa
   set_zero(mismatch, n);
   set_zero(still, n);
   if (!orthocas_check_settings(arm, safety)) return ORTHOCAS_BAD_INPUT;
-  if (!all_within(q, n, arm->numbers.farthest) || !all_finite(arm, torque, n)) return ORTHOCAS_NOT_FINITE;
+  if (!is_position(arm, q) || !all_finite(arm, torque, n)) return ORTHOCAS_NOT_FINITE;
   if (arm->torque) arm->kernels.fallback(q, gains, holding);
   else arm->kernels.dynamics(q, still, M, bias, holding);
   if (!all_finite(arm, holding, n)) return ORTHOCAS_NOT_FINITE;
@@ -1259,10 +1234,10 @@ ORTHOCAS_API int orthocas_check_start(const orthocas_arm *arm, const orthocas_sa
 }
 
 static void begin(const orthocas_arm *arm, orthocas_state *state, const double *q, const double *command, double *work) {
-  const int n = arm->n, is_position = all_within(q, n, arm->numbers.farthest);
+  const int n = arm->n, seen = is_position(arm, q);
   double *measured = take(&work, arm->k), *error = take(&work, arm->k), *shared = take(&work, arm->shared);
   int i;
-  copy(state->q, is_position ? q : arm->centre, n);
+  copy(state->q, seen ? q : arm->centre, n);
   for (i = 0; i < n; ++i) state->q[i] = unturned(arm, state, i, state->q[i]);
   if (arm->memory > 0) copy(state->memory, arm->memory_start, arm->memory);
   state->fresh = 1;
@@ -1270,7 +1245,7 @@ static void begin(const orthocas_arm *arm, orthocas_state *state, const double *
   copy(state->anchor, state->q, n);
   fallback_at(arm, state->q, arm->default_gains, state->command);
   take_command(arm, state, command);
-  if (!is_position) state->bad_ticks = rules.forever;
+  if (!seen) state->bad_ticks = rules.forever;
   arm->kernels.shared(state->q, state->dq, shared);
   arm->kernels.deviation(shared, state->q, state->reference.value, measured, error);
   if (all_finite(arm, measured, arm->k)) copy(state->reference.value, measured, arm->k);
@@ -1299,9 +1274,9 @@ ORTHOCAS_API void orthocas_resume(orthocas_state *state) {
 /* R26: brakes hold the arm at q (HOLD), or do so no more (CATCHER). Nothing that was felt or remembered holds on. */
 ORTHOCAS_API void orthocas_stand(const orthocas_arm *arm, orthocas_state *state, int mode, const double *q,
                                  const double *command) {
-  const int n = arm->n, is_position = all_within(q, n, arm->numbers.farthest);
+  const int n = arm->n, seen = is_position(arm, q);
   int i;
-  for (i = 0; i < n && is_position; ++i) state->q[i] = unturned(arm, state, i, q[i]);
+  for (i = 0; i < n && seen; ++i) state->q[i] = unturned(arm, state, i, q[i]);
   set_zero(state->dq, n);
   set_zero(state->impulse, n);
   if (arm->torque) {
