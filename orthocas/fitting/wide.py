@@ -517,7 +517,8 @@ class WideFit(Fit):
         facts = super().facts()
         share = percent(self.regular_share, 2)
         named, meaning = self.chart.parts.named_coordinates, ""
-        joints = listed(getattr(self.chart.coordinates.parametrisation, "without", ()))
+        family = getattr(self.chart.coordinates, "parametrisation", None)
+        joints = listed(getattr(family, "without", ()))
         clear = "clear and free" if FREE in self.chart.notes else "clear"
         if "exact" in self.chart.notes:
             meaning = f"{'; '.join(named)}, exactly"
