@@ -53,7 +53,7 @@ def main(quick: bool = False) -> dict[str, float]:
         with TemporaryDirectory() as folder:
             generated = oc.generate_c(chart, folder, law, "arm", single_precision=single)
             library = CompiledLibrary(compile_shared(generated, Path(folder)), "arm", chart.n, single)
-            supervised, sizes = supervised_library(Path(folder), library)
+            supervised, sizes = _supervised(Path(folder), library)
             ticks = [time.median for time in time_ticks([(law, library), (law, supervised)], 2000 if quick else 50_000)]
             proofs.append(max(check_c(generated, chart, law, 100 if quick else 1000).differences.values()))
             if coupling == "coupled":
@@ -69,7 +69,7 @@ def main(quick: bool = False) -> dict[str, float]:
     return {"flange": apart, "proof": proofs[-1]}
 
 
-def supervised_library(folder: Path, library: CompiledLibrary) -> tuple[CompiledLibrary, list[int]]:
+def _supervised(folder: Path, library: CompiledLibrary) -> tuple[CompiledLibrary, list[int]]:
     """A library whose control function is a tick of the supervised law, and the sizes of state and settings [bytes]."""
     source, target = folder / "supervised.c", folder / "libsupervised.so"
     source.write_text(_SUPERVISED)
