@@ -205,7 +205,11 @@ class ChartKernel:
         return q, status.astype(np.int64), owner.astype(np.int64)
 
     def solve_all(self, target: Array, xi: float, start: Array | None, allowed: Sequence[int]) -> tuple[Array, Indices]:
-        """All postures (N, n) of a target (k,) and xi on its curves, and their charts; a start leads to curves, too."""
+        """All postures (N, n) of a target (k,) and xi on its curves, and their charts; a start leads to curves, too.
+
+        Raises:
+            InvalidValueError: if there are more than 1,000.
+        """
         flags, n = np.zeros(len(self.charts), dtype=np.int8), self.maps.robot.n
         flags[list(allowed)] = 1
         room = np.empty(CURVES.nodes * (2 * n + 1) + (len(self.maps.stored.q) + 1) // 2)
@@ -215,6 +219,8 @@ class ChartKernel:
             *(pointer(flags), ctypes.byref(self._range), CURVES.patience, pointer(room), CURVES.nodes),
             *(pointer(q), pointer(owner), RULES.every),
         )
+        if count > RULES.every:
+            raise InvalidValueError("xi", f"{xi:g}, which more than {RULES.every} postures have", "fewer postures")
         return q[:count], owner[:count].astype(np.int64)
 
     def build_targets(self, vectors: Array) -> Array:

@@ -62,10 +62,6 @@ class SelfMotionCurves:
 
     def search(self, targets: Array, own: Array, tolerance: float) -> Nearest:
         """The nearest points for targets (N, n) of phi, from stored starts and one of the caller's (N, n)."""
-        if len(own) and self.has_kernel:
-            first, more = self.stages(targets, own)
-            starts = np.concatenate([first, more]).transpose(1, 0, 2)
-            return Nearest(*self.kernel.search(targets, starts, len(first), tolerance))
         pieces = [slice(first, first + _AT_ONCE) for first in range(0, len(own), _AT_ONCE)]
         found = [self._search(targets[rows], own[rows], tolerance) for rows in pieces]
         parts = zip(*(vars(part).values() for part in (Nearest.empty(own[:0]), *found)), strict=True)
@@ -112,6 +108,10 @@ class SelfMotionCurves:
             yield traces
 
     def _search(self, targets: Array, own: Array, tolerance: float) -> Nearest:
+        if self.has_kernel:
+            first, more = self.stages(targets, own)
+            starts = np.concatenate([first, more]).transpose(1, 0, 2)
+            return Nearest(*self.kernel.search(targets, starts, len(first), tolerance))
         best, ends, traced = Nearest.empty(own), Ends.empty(own.shape[1]), list[Traces]()
         with np.errstate(all="ignore"):
             for starts in self.stages(targets, own):

@@ -67,6 +67,7 @@ def compile_inverse(chart: Chart, folder: str | Path | None = None) -> CompiledI
         sources = {path.name: path.read_text(encoding="utf-8") for path in sorted(drafts.glob("*.[hc]"))}
     sources[_ROWS] = get_source(_ROWS)
     library = keep_library("inverse", sources, (*_FLAGS, f"-DN={chart.n}"), folder)
+    # compiled now, so that no later call waits for it
     has_library(SearchKernel(chart, library.parent))
     return CompiledInverse(chart, library)
 

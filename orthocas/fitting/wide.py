@@ -39,6 +39,7 @@ from orthocas.fitting.wide_search import (
     WideSolution,
     find_best,
     is_on_side_of_centre,
+    list_left_out,
     sample_plain_frames,
     search_families,
 )
@@ -360,8 +361,7 @@ def _prepare(problem: Problem, family: Parametrisation, like: Likeness | None) -
 def _find_free_turns(problem: Problem, family: Parametrisation) -> tuple[str, ...]:
     """Joints that turn tool or base and that a family does without: it is regular at any turn of them, or at none."""
     names = problem.robot.joint_names
-    left_out = getattr(family, "without", ())
-    places = {name: names.index(name) for name in left_out if name in names}
+    places = {name: names.index(name) for name in list_left_out(family) if name in names}
     return tuple(name for name, k in places.items() if turns_tool(problem.task, k) or keeps_self_motions(problem, k))
 
 
@@ -441,7 +441,7 @@ def _finish(
         left_out=_describe_left_out(clear, branch, counted, share),
         meaning=error,
         like=quantities.measure_distances(problem, coordinates, seed) if quantities is not None and followed else {},
-        least_leak=_bound_leak(problem, getattr(coordinates.parametrisation, "without", ()), seed),
+        least_leak=_bound_leak(problem, list_left_out(coordinates.parametrisation), seed),
     )
 
 
@@ -517,8 +517,7 @@ class WideFit(Fit):
         facts = super().facts()
         share = percent(self.regular_share, 2)
         named, meaning = self.chart.parts.named_coordinates, ""
-        family = getattr(self.chart.coordinates, "parametrisation", None)
-        joints = listed(getattr(family, "without", ()))
+        joints = listed(list_left_out(getattr(self.chart.coordinates, "parametrisation", None)))
         clear = "clear and free" if FREE in self.chart.notes else "clear"
         if "exact" in self.chart.notes:
             meaning = f"{'; '.join(named)}, exactly"

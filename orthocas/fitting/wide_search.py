@@ -164,6 +164,11 @@ def search_families(searches: Sequence["Search"]) -> "Search":
     return best
 
 
+def list_left_out(family: Parametrisation | None) -> tuple[str, ...]:
+    """Names of joints that a family does without."""
+    return getattr(family, "without", ())
+
+
 def find_best(searches: Sequence["Search"]) -> "Search":
     """The search with the best coordinates so far."""
     return min((search for search in searches if search.best is not None), key=lambda search: search.rank)
@@ -192,7 +197,7 @@ class Search:
         self.family = parametrisation.family(JointSpace.of(problem), problem.r)
         self.linear = isinstance(self.family, LinearFamily)
         #: names of joints that coordinates do not depend on
-        self.left_out: tuple[str, ...] = getattr(parametrisation, "without", ())
+        self.left_out = list_left_out(parametrisation)
         wide = int(np.clip(RULES.per_term * self.family.width, RULES.least_samples, RULES.most_samples))
         of_networks = RULES.small_network_samples if self.left_out else RULES.network_samples
         self.samples = settings.samples or (wide if self.linear else of_networks)

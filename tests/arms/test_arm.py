@@ -1,7 +1,9 @@
 """`oc.Arm`: task values in all forms, postures with x and xi, and files."""
 
+import contextlib
 import pickle
 import zipfile
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 
@@ -11,7 +13,7 @@ import pytest
 from programs import nightly
 
 import orthocas as oc
-from orthocas.arms import Postures
+from orthocas.arms import Postures, chart_kernel
 from orthocas.arms import arm as arm_module
 from orthocas.charts.inverse import InverseStatus
 from orthocas.errors import ChartFileError, InvalidValueError, NotRedundantError, OrthocasError, UnknownNameError
@@ -294,3 +296,16 @@ def test_where_full_turns_change_xi_an_arm_finds_as_many_as_its_chart() -> None:
         apart = np.abs(wrap_shortest(theirs[:, None] - own, turns)).max(axis=2)
         assert len(theirs) > 3
         assert apart.min(axis=1).max() < 1e-4
+
+
+def test_more_postures_than_there_is_room_for_are_an_error(monkeypatch: pytest.MonkeyPatch) -> None:
+    """They are not cut off in silence."""
+    arm = oc.Arm.load("panda")
+    q = arm.charts[0].domain.sample(20, 3)
+    counts = [len(arm.solve(arm.x(row), arm.charts[0].xi(row)[0], all=True).q) for row in q]
+    row = q[int(np.argmax(counts))]
+    assert max(counts) > 1
+    for room, fits in ((max(counts), True), (1, False)):
+        monkeypatch.setattr(chart_kernel, "RULES", replace(chart_kernel.RULES, every=room))
+        with contextlib.nullcontext() if fits else pytest.raises(InvalidValueError, match="more than 1 postures have"):
+            assert len(arm.solve(arm.x(row), arm.charts[0].xi(row)[0], all=True).q) == max(counts)
