@@ -100,7 +100,7 @@ def fit_wide(
     1. Under a whole pose or orientation, families without the last joint come first. If the first one can turn fully,
        families without both come before these. Then xi stays while base or tool turn about their own axes: full turns
        close, and rolling the hand moves no other joint. With r = 1, these are networks,
-       MLP((32, 32), raw=True, activation="isru"): they lean less into the task than polynomials, but have no proof in
+       MLP((24, 24, 24), raw=True, activation="isru"): they lean less into the task than polynomials, but have no proof in
        a useful time. With several coordinates or `like`, they are polynomials, linear in the first joint. A family is
        kept if it leaves out little of the branch after all rounds of 4. Where the first result leaves out more than a
        tenth, 3 follows.

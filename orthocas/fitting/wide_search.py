@@ -39,7 +39,7 @@ class WideRules:
     degree: int = 6  #: of polynomials that are linear in base and tool joints
     degree_of_all: int = 5  #: of polynomials in which these count like all others
     network: MLP = MLP((64, 64, 64), raw=True, activation="isru")  #: where polynomials leave out much
-    small_network: MLP = MLP((32, 32), raw=True, activation="isru")  #: without some of the joints
+    small_network: MLP = MLP((24, 24, 24), raw=True, activation="isru")  #: without some of the joints
 
     alignment: float = 0.3  #: weight of the mean sin^2 of the leaks
     alignment_in_metric: float = 1.0  #: the same in another metric than the identity
