@@ -12,7 +12,7 @@ from orthocas.bases.circle import Circle
 from orthocas.bases.cyclic import Cyclic, Mobile, parse_suffix
 from orthocas.bases.family import Parametrisation
 from orthocas.bases.given import SEW, Given, SEWKind
-from orthocas.bases.mlp import MLP
+from orthocas.bases.mlp import ACTIVATIONS, MLP
 from orthocas.bases.products import JOINTS, Fourier, Linear, Polynomial
 from orthocas.errors import InvalidValueError, NotSavableWarning
 from orthocas.tools.checks import require_kind, require_known
@@ -168,8 +168,10 @@ def _parse_products(text: str) -> tuple[int, Cyclic, int | None, tuple[str, ...]
 def _parse_mlp(text: str) -> MLP:
     widths, _, rest = text.partition(":")
     raw, _, joints = rest.partition(":") if rest.partition(":")[0] == "raw" else ("", "", rest)
-    cyclic, without = parse_suffix(joints, "after the widths 'raw'")
-    return MLP(tuple(_parse_whole(width) for width in widths.split("x")), bool(raw), cyclic, without)
+    activation, _, others = joints.partition(":")
+    activation, joints = (activation, others) if activation in ACTIVATIONS else ("tanh", joints)
+    cyclic, without = parse_suffix(joints, "after the widths 'raw', then 'isru'")
+    return MLP(tuple(_parse_whole(width) for width in widths.split("x")), bool(raw), cyclic, without, activation)
 
 
 def _parse_linear(text: str) -> Linear:

@@ -46,8 +46,10 @@ from orthocas.certificates.taylor import (
     Variables,
     compute_margin,
     cosine,
+    reciprocal,
     sine,
     square,
+    square_root,
     stack,
     sum_error,
     tanh,
@@ -487,12 +489,13 @@ class ProductRows:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class NetworkRows:
-    """J_xi of xi = W_out tanh(W_2 tanh(W_1 [sin q; cos q; q] + b_1) + b_2) + A q on boxes."""
+    """J_xi of xi = W_out a(W_2 a(W_1 [sin q; cos q; q] + b_1) + b_2) + A q on boxes."""
 
     layers: tuple[tuple[Array, Array], ...]  #: weights (out, in) and biases (out,)
     turning: list[int]  #: joints that enter as sine and cosine
     direct: list[int]  #: joints that enter as q itself
     slopes: Array  #: A of all joints, (r, n); 0 for those of the network
+    activation: str  #: a
 
     @classmethod
     def build(cls, family: MLPFamily, theta: Array) -> "NetworkRows":
@@ -500,7 +503,7 @@ class NetworkRows:
         layers = tuple((V.T.copy(), b) for V, b in zip(*split_layers(theta, family.widths), strict=True))
         slopes = np.zeros((family.outputs, family.space.n))
         slopes[:, list(family.linear)] = family.split_slopes(theta)
-        return cls(layers, family.turning, family.direct, slopes)
+        return cls(layers, family.turning, family.direct, slopes, family.activation)
 
     def __call__(self, joints: list[TaylorModel], half_widths: Array, variables: Variables) -> TaylorModel:
         """J_xi, (r, n, boxes), for models of the joints."""
@@ -509,8 +512,14 @@ class NetworkRows:
         layer, slopes = stack([*sines, *cosines, *(joints[i] for i in self.direct)]), []
         one = TaylorModel.constant(np.ones((1, 1)))
         for W, b in self.layers[:-1]:
-            layer = tanh(_multiply_weights(W, layer) + TaylorModel.constant(b[:, None]))
-            slopes.append(one - square(layer))
+            layer = _multiply_weights(W, layer) + TaylorModel.constant(b[:, None])
+            if self.activation == "tanh":
+                layer = tanh(layer)
+                slopes.append(one - square(layer))
+            else:
+                root = reciprocal(square_root(one + square(layer)))
+                layer = layer * root
+                slopes.append(root * square(root))
         rows = []
         for weights, constants in zip(self.layers[-1][0], self.slopes, strict=True):
             gradient = TaylorModel.constant(weights[:, None])

@@ -166,7 +166,7 @@ def _write_tuple(values: Iterable[int]) -> str:
 
 
 def _build_network(coordinates: Coordinates) -> Form | None:
-    """xi = W_out tanh(... tanh(W_0 u + b_0) ...) + A q + c; None if the coordinates are no network."""
+    """xi = W_out a(... a(W_0 u + b_0) ...) + A q + c; None if the coordinates are no network."""
     family = coordinates.family
     if not isinstance(family, MLPFamily):
         return None
@@ -188,7 +188,7 @@ def _build_network(coordinates: Coordinates) -> Form | None:
     for k in range(depth):
         tables |= {f"W_{k}": weights[k].T, f"b_{k}": biases[k][:, None]}
     plain = {name: [int(k) for k in of] for name, of in indices.items()}
-    return Form("coordinates", {"kind": "network", "depth": depth}, "", tables, plain)
+    return Form("coordinates", {"kind": "network", "depth": depth, "activation": family.activation}, "", tables, plain)
 
 
 def write_statuses() -> str:

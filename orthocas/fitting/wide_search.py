@@ -8,6 +8,7 @@ import scipy
 from numpy.typing import NDArray
 
 from orthocas.bases.family import ArrayFamily, CombinableFamily, JointSpace, LinearFamily, Parametrisation
+from orthocas.bases.mlp import MLP
 from orthocas.charts.coordinates import Coordinates
 from orthocas.errors import InvalidValueError
 from orthocas.fitting.basis_objective import BasisGradients, BasisObjective, build_gradients
@@ -37,8 +38,8 @@ class WideRules:
     clearance: float = 0.1  #: default least relative singular value of the task
     degree: int = 6  #: of polynomials that are linear in base and tool joints
     degree_of_all: int = 5  #: of polynomials in which these count like all others
-    network: tuple[int, ...] = (64, 64, 64)  #: layers where polynomials leave out much
-    small_network: tuple[int, ...] = (24, 24, 24)  #: layers of those that leave out joints
+    network: MLP = MLP((64, 64, 64), raw=True, activation="isru")  #: where polynomials leave out much
+    small_network: MLP = MLP((24, 24, 24), raw=True, activation="isru")  #: without some of the joints
 
     alignment: float = 0.3  #: weight of the mean sin^2 of the leaks
     alignment_in_metric: float = 1.0  #: the same in another metric than the identity

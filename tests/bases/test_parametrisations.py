@@ -19,7 +19,7 @@ SLIDING = JointSpace(SPACE.centre, SPACE.half_width, (False, True, False), SPACE
 GIVEN = oc.Given.from_function("by hand", 3, lambda q: ca.vertcat(ca.sin(q[0]) * q[1], q[2] + 2))
 REDUCED = [oc.Polynomial(3, cyclic=["b"]), oc.Fourier(2, cyclic=("a", "c"))]
 SPARSE = [oc.Polynomial(4, joints=2), oc.Fourier(3, ("b",), joints=1)]
-PARTLY = oc.MLP((5, 4), raw=True, cyclic=["b"], without=["c"])
+PARTLY = oc.MLP((5, 4), raw=True, cyclic=["b"], without=["c"], activation="isru")
 ALL = [oc.Linear(), oc.Polynomial(3), oc.Fourier(2), *REDUCED, *SPARSE, oc.MLP((5, 4)), PARTLY, GIVEN]
 
 
@@ -135,6 +135,16 @@ def test_mlp_is_the_formula_of_the_paper_and_takes_sliding_joints_raw() -> None:
     np.testing.assert_allclose(values(oc.MLP((4, 3)), SLIDING, q[None], theta)[0], want, atol=1e-13)
 
 
+def test_inverse_square_root_units_are_their_formula() -> None:
+    parametrisation = oc.MLP((3,), raw=True, activation="isru")
+    theta, q = np.random.default_rng(2).normal(size=20), np.array([0.3, 1.7, -0.4])
+    z = theta[:9].reshape(3, 3, order="F") @ q + theta[9:12]
+    want = theta[12:18].reshape(2, 3, order="F") @ (z / np.sqrt(1 + z**2)) + theta[18:]
+    np.testing.assert_allclose(values(parametrisation, SPACE, q[None], theta)[0], want, atol=1e-13)
+    with pytest.raises(UnknownNameError, match="known: tanh, isru"):
+        oc.MLP((3,), activation="relu")
+
+
 def test_embedding_keeps_the_function() -> None:
     coarse, fine = oc.Polynomial(2).family(SPACE, 2), oc.Polynomial(4).family(SPACE, 2)
     theta = coarse.initial(3)
@@ -220,7 +230,8 @@ def test_linear_normals_at_bad_bases_are_refused() -> None:
         "fourier:2:joints=1:cyclic=a,b",
         "mlp:64x64",
         "mlp:24x24:raw",
-        "mlp:24x24:raw:cyclic=a:without=b,c",
+        "mlp:24x24:isru",
+        "mlp:24x24:raw:isru:cyclic=a:without=b,c",
         "mlp:8:without=c",
         "polynomial:4:cyclic=a:without=b,c",
         "fourier:2:without=c",
@@ -242,7 +253,7 @@ def test_labels_are_read_back(label: str) -> None:
         ("polynomial:3:joints=two", InvalidValueError, "whole numbers"),
         ("polynomial:3:cyclic:joints=2", InvalidValueError, "after the degree 'joints=2', then 'cyclic'"),
         ("mlp:64x", InvalidValueError, "whole numbers"),
-        ("mlp:64:smooth", InvalidValueError, "after the widths 'raw', then 'cyclic'"),
+        ("mlp:64:smooth", InvalidValueError, "after the widths 'raw', then 'isru', then 'cyclic'"),
         ("mlp:0", InvalidValueError, "hidden is 0"),
         ("sew:left", UnknownNameError, "known: conventional, stereographic"),
         ("linear:2", InvalidValueError, "'linear' without a number"),

@@ -116,7 +116,11 @@ class Reader:
         psi = np.array([np.prod(f[list(term), range(n)]) for term in chosen])
         return theta.reshape(-1, len(psi)) @ psi
 
-    def mlp(self, q: Array, theta: Array, hidden: list[int], raw: bool, cyclic: Any = (), without: Any = ()) -> Array:
+    def mlp(
+        self, q: Array, theta: Array, hidden: list[int], raw: bool, activation: str = "tanh", **others: list[str]
+    ) -> Array:
+        cyclic, without = others.get("cyclic", []), others.get("without", [])
+        of = np.tanh if activation == "tanh" else lambda z: z / np.sqrt(1 + z**2)
         kinds = [self.header["robot"]["joint_kinds"][i] for i in self.active]
         linear = self.places(cyclic)
         inputs = [i for i in range(len(q)) if i not in linear + self.places(without)]
@@ -127,7 +131,7 @@ class Reader:
         for layer, (width, out) in enumerate(pairwise(widths)):
             W = theta[used : used + out * width].reshape(width, out).T
             y = W @ y + theta[used + out * width :][:out]
-            y, used = y if layer == len(hidden) else np.tanh(y), used + out * (width + 1)
+            y, used = y if layer == len(hidden) else of(y), used + out * (width + 1)
         return y + theta[used:].reshape(len(linear), len(y)).T @ q[linear]
 
 
@@ -166,7 +170,8 @@ def test_reader_from_the_page_reads_joints_that_enter_linearly_or_not_at_all(
     robot = planar_xy.robot
     problem = oc.Problem(robot, oc.Task.position(robot, "xy"), domain=oc.Box([0.6, 0.8, 0.8], [0.3, 0.2, 0.2]))
     rest: dict[str, Any] = {"cyclic": "auto", "without": ["q3"]}
-    for family in (oc.Polynomial(3, **rest), oc.Fourier(2, **rest), oc.MLP((4, 3), **rest)):
+    network = oc.MLP((4, 3), **rest, activation="isru")
+    for family in (oc.Polynomial(3, **rest), oc.Fourier(2, **rest), network):
         chart = oc.fit(problem, family, samples=100).chart
         chart.save(tmp_path / f"{family.label[:4]}.orthocas")
         settings = Reader(tmp_path / f"{family.label[:4]}.orthocas").header["coordinates"]["settings"]

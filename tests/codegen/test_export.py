@@ -68,7 +68,7 @@ def sliding(parametrisation: Any) -> oc.Chart:
 OTHERS: dict[str, Callable[[], oc.Chart]] = {
     "network with a prismatic joint": lambda: sliding(oc.MLP((5, 7))),
     "network beside two other joints": lambda: sliding(
-        oc.MLP((5, 7), cyclic=["torso_lift_joint"], without=["arm_6_joint"])
+        oc.MLP((5, 7), cyclic=["torso_lift_joint"], without=["arm_6_joint"], activation="isru")
     ),
     "polynomial with a prismatic joint": lambda: sliding(oc.Polynomial(3)),
     "SEW angle": lambda: oc.fit(oc.Problem(*arm_with("pose")), oc.SEW()).chart,

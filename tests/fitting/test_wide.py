@@ -315,7 +315,7 @@ def test_a_hand_that_rolls_moves_no_other_joint_and_closes_its_turns() -> None:
 @pytest.mark.slow
 def test_coordinates_without_the_roll_are_tried_first(tmp_path: Path) -> None:
     fit = oc.fit_wide(iiwa(), oc.Task.pose(iiwa()), home_branch(), samples=10_000)
-    assert fit.chart.coordinates.label == "mlp:24x24x24:raw:without=A7"
+    assert fit.chart.coordinates.label == "mlp:24x24x24:raw:isru:without=A7"
     assert fit.regular_share > 0.998
     fit.chart.save(tmp_path / "wide.orthocas")
     q = sample_uniform(fit.chart.problem.domain, 50, 1)
@@ -328,10 +328,10 @@ def test_the_first_families_leave_out_the_turn_of_the_tool_and_of_a_base_that_tu
     """One coordinate is a network, a swivel a polynomial; the base of the iiwa has limits, the other one has none."""
     endless = oc.Robot.from_urdf(Path(__file__).parents[1] / "data" / "robots" / "four_endless_joints.urdf")
     for robot, metric, like, expected in (
-        (iiwa(), "euclidean", None, ["mlp:24x24x24:raw:without=A7"]),
-        (iiwa(), "inertia", None, ["mlp:24x24x24:raw:without=A7"]),
+        (iiwa(), "euclidean", None, ["mlp:24x24x24:raw:isru:without=A7"]),
+        (iiwa(), "inertia", None, ["mlp:24x24x24:raw:isru:without=A7"]),
         (iiwa(), "euclidean", "swivel", ["polynomial:6:cyclic=A1:without=A7"]),
-        (endless, "euclidean", None, ["mlp:24x24x24:raw:without=j1,j7", "mlp:24x24x24:raw:cyclic=j1:without=j7"]),
+        (endless, "euclidean", None, ["mlp:24x24x24:raw:isru:without=j1,j7", "mlp:24x24x24:raw:isru:cyclic=j1:without=j7"]),
     ):
         task = oc.Task.pose(robot)
         problem = oc.Problem(robot, task, metric, regular_box(robot, task))

@@ -74,7 +74,7 @@ def network() -> oc.Chart:
 def partly_linear() -> oc.Chart:
     """A network of one joint; the base enters linearly, and the last joint not at all."""
     known = problems.get("planar_3r_xy")
-    network = oc.MLP((6, 6), raw=True, cyclic=["q1"], without=["q3"])
+    network = oc.MLP((6, 6), raw=True, cyclic=["q1"], without=["q3"], activation="isru")
     return oc.fit(known, network, solvers.LBFGS(max_iterations=10), samples=300).chart
 
 
