@@ -316,7 +316,7 @@ static void open_all(const orthocas_arm *which) {
 static void start_law(const orthocas_arm *which) {
   static const double still[N] = {0};
   open_all(which);
-  orthocas_take_over(arm, &state, q, still, work);
+  orthocas_begin(arm, &state, ORTHOCAS_LAW, q, still, work);
   orthocas_reference_at(arm, q, &reference, work);
 }
 
@@ -615,20 +615,20 @@ static void test_modes(void) {
   double held[N] = {1, 1, 1};
   int k;
   open_all(arm); /* well inside, the law takes over by itself */
-  orthocas_start(arm, &state, q, 0, work);
+  orthocas_begin(arm, &state, ORTHOCAS_CATCHER, q, 0, work);
   orthocas_reference_at(arm, q, &reference, work);
   CHECK(step(1e-3) == ORTHOCAS_OK);
   CHECK(steps(40) == ORTHOCAS_OK);
   CHECK(state.weight >= 1.0);
   open_all(arm); /* with a command; at a position that is none; with a command that is none */
-  orthocas_start(arm, &state, q, held, work);
+  orthocas_begin(arm, &state, ORTHOCAS_CATCHER, q, held, work);
   CHECK(fabs(state.command[0] - 1.0) < 1e-12);
   held[1] = NAN;
-  orthocas_start(arm, &state, held, held, work);
+  orthocas_begin(arm, &state, ORTHOCAS_CATCHER, held, held, work);
   CHECK(step(1e-3) == ORTHOCAS_CAUGHT || step(1e-3) == ORTHOCAS_OK);
   open_all(arm); /* outside, the catcher holds the arm; the way back */
   set(q, 1.49, 0, 0);
-  orthocas_start(arm, &state, q, 0, work);
+  orthocas_begin(arm, &state, ORTHOCAS_CATCHER, q, 0, work);
   orthocas_reference_at(arm, q, &reference, work);
   CHECK(steps(3) == ORTHOCAS_CAUGHT);
   orthocas_resume(&state);
@@ -647,7 +647,7 @@ static void test_modes(void) {
   /* On the way, it does not work, so the anchor goes on to the centre; then a joint is too fast. */
   open_all(arm);
   set(q, 1.49, 0, 0);
-  orthocas_start(arm, &state, q, 0, work);
+  orthocas_begin(arm, &state, ORTHOCAS_CATCHER, q, 0, work);
   (void)steps(2);
   orthocas_resume(&state);
   fault.status = ORTHOCAS_SINGULAR;
@@ -698,11 +698,11 @@ static void test_modes(void) {
   CHECK(steps(2) != ORTHOCAS_BAD_INPUT);
   open_all(arm); /* near the boundary; beyond it */
   set(q, 1.43, 0, 0);
-  orthocas_take_over(arm, &state, q, dq, work);
+  orthocas_begin(arm, &state, ORTHOCAS_LAW, q, dq, work);
   orthocas_reference_at(arm, q, &reference, work);
   CHECK(steps(2) == ORTHOCAS_NEAR_BOUNDARY || arm->boundary.lines > 0);
   q[0] = -1.49;
-  orthocas_take_over(arm, &state, q, dq, work);
+  orthocas_begin(arm, &state, ORTHOCAS_LAW, q, dq, work);
   CHECK(step(1e-3) == ORTHOCAS_CAUGHT);
   CHECK(state.cause == ORTHOCAS_OUTSIDE_DOMAIN);
   /* The spring gives way, stops push back, loads are learned, and a fast arm is slowed down. */
@@ -749,7 +749,7 @@ static void test_reference(void) {
   }
   open_all(arm); /* begins where nothing is measured */
   fault.deviation = NAN;
-  orthocas_take_over(arm, &state, q, dq, work);
+  orthocas_begin(arm, &state, ORTHOCAS_LAW, q, dq, work);
   orthocas_reference_at(arm, q, &reference, work);
   CHECK(is_finite(arm, &state.reference) && is_finite(arm, &reference));
   q[0] = NAN;
@@ -757,7 +757,7 @@ static void test_reference(void) {
   CHECK(is_finite(arm, &reference));
   /* The catcher releases the arm where errors are no numbers. */
   open_all(arm);
-  orthocas_start(arm, &state, q, 0, work);
+  orthocas_begin(arm, &state, ORTHOCAS_CATCHER, q, 0, work);
   fault.deviation = NAN;
   (void)steps(2);
   CHECK(all_finite(arm, state.offset, K));
@@ -800,7 +800,7 @@ static void test_reference(void) {
   for (k = 0; k < 4; ++k) {
     open_all(arm);
     set(q, 1.4, 0, 0);
-    orthocas_take_over(arm, &state, q, dq, work);
+    orthocas_begin(arm, &state, ORTHOCAS_LAW, q, dq, work);
     orthocas_reference_at(arm, q, &reference, work);
     state.fresh = 0;
     fault.singular = k == 2;
@@ -863,15 +863,15 @@ static void test_observer(void) {
 static void test_memory(void) {
   double held[N] = {1, 2, 3}, none[N] = {NAN, 0, 0};
   open_all(arm);
-  orthocas_start(arm, &state, q, held, work);
+  orthocas_begin(arm, &state, ORTHOCAS_CATCHER, q, held, work);
   CHECK(state.fresh == 2);
   (void)step(1e-3);
   CHECK(state.fresh == 0 && fabs(state.memory[N] - (1.0 - 0.01)) < 0.1);
-  orthocas_start(arm, &state, q, none, work);
+  orthocas_begin(arm, &state, ORTHOCAS_CATCHER, q, none, work);
   CHECK(state.fresh == 1);
-  orthocas_start(arm, &state, q, 0, work);
+  orthocas_begin(arm, &state, ORTHOCAS_CATCHER, q, 0, work);
   CHECK(state.fresh == 1);
-  orthocas_start(arm, &state, none, held, work); /* no measurement at the start: learned from the fallback there */
+  orthocas_begin(arm, &state, ORTHOCAS_CATCHER, none, held, work); /* no measurement at the start: learned from the fallback there */
   set(q, NAN, 0, 0);
   CHECK(steps(5) == ORTHOCAS_BAD_INPUT);
   CHECK(state.fresh == 1);

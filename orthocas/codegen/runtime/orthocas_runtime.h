@@ -33,7 +33,7 @@ enum {
 };
 enum { ORTHOCAS_LAW = 0, ORTHOCAS_CATCHER = 1, ORTHOCAS_RETURN = 2, ORTHOCAS_HOLD = 3 };
 
-/* Values of the controlled quantities with two derivatives: places of k numbers each. */
+/* Values of the controlled quantities with two derivatives: places of k numbers each, one after the other. */
 typedef struct {
   double *value, *velocity, *acceleration;
 } orthocas_reference;
@@ -179,7 +179,7 @@ typedef struct {
 /* Numbers and integers of `work` that functions need at most. */
 #define ORTHOCAS_INVERSE_WORK(n) ((n) * ((n) + 7))
 #define ORTHOCAS_NEAREST_WORK(n, rooms)                                                                               \
-  (4 * (n) * (n) + 14 * (n) + 4 * (rooms) + 3 * (n) * (rooms) + (2 * (n) + (rooms)) * (2 * (n) + (rooms) + 1))
+  (5 * (n) * (n) + 14 * (n) + 4 * (rooms) + 3 * (n) * (rooms) + (2 * (n) + (rooms)) * (2 * (n) + (rooms) + 1))
 #define ORTHOCAS_NEAREST_HELD(n, rooms) ((n) + (rooms))
 #define ORTHOCAS_LAW_WORK(n, k, shared, memory) (3 * (n) * (n) + 10 * (n) + 9 * (k) + (shared) + (memory))
 
@@ -207,10 +207,8 @@ ORTHOCAS_API int orthocas_control(const orthocas_arm *arm, const double *q, cons
 ORTHOCAS_API int orthocas_check_settings(const orthocas_arm *arm, const orthocas_safety *safety);
 ORTHOCAS_API int orthocas_check_start(const orthocas_arm *arm, const orthocas_safety *safety, const double *q,
                                       const double *torque, const void *gains, double *mismatch, double *work);
-ORTHOCAS_API void orthocas_start(const orthocas_arm *arm, orthocas_state *state, const double *q, const double *command,
-                                 double *work);
-ORTHOCAS_API void orthocas_take_over(const orthocas_arm *arm, orthocas_state *state, const double *q,
-                                     const double *command, double *work);
+ORTHOCAS_API void orthocas_begin(const orthocas_arm *arm, orthocas_state *state, int mode, const double *q,
+                                 const double *command, double *work);
 ORTHOCAS_API void orthocas_resume(orthocas_state *state);
 ORTHOCAS_API void orthocas_stand(const orthocas_arm *arm, orthocas_state *state, int mode, const double *q,
                                  const double *command);
