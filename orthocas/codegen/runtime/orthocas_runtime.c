@@ -2,7 +2,7 @@
  *
  * Read it from top to bottom: constants; numbers; chart and dynamics; inverse map; then the supervised law: its modes as
  * a table, its boundary, its sensors, its references, its modes in code, the catcher, memory, one tick; and references
- * of programs. R1 to R31 are requirements; docs/reference/runtime.md says which tests check which.
+ * of programs. R1 to R34 are requirements; docs/reference/runtime.md says which tests check which.
  *
  * C99, no global variables, no heap, no input, no output. Every array has the size that orthocas_runtime.h says; local
  * arrays are places in `work`, which a caller owns.
@@ -21,7 +21,7 @@ static const struct {
   int halvings;
 #ifndef ORTHOCAS_CHART_ONLY
   double turn, longest, implausible, jitter, alike, stirring, slowest, standing, room, nearly, slow, settling, giving;
-  double learning, lifted, far_off, deep, hasty, stopping, trend, contact;
+  double learning, lifted, touching, far_off, deep, hasty, stopping, trend, contact;
   int forever, bisections, sweeps;
 #endif
 } rules = {
@@ -42,6 +42,7 @@ static const struct {
   .giving = 0.02,            /* share of the spring or load that a fast arm takes away in a tick */
   .learning = 2.0,           /* rate at which the load is learned, slower than the catcher's modes [1/s] */
   .lifted = 0.5,             /* largest load, in limits of the command: the other half is for motion */
+  .touching = 60.0,          /* rate at which contacts are felt, faster than loads are learned [1/s] */
   .far_off = 0.1,            /* from what the observer of velocities expects: it begins anew [rad] or [m] */
   .deep = 0.5,               /* so near to the path of a corridor is near enough: it may run along a limit [radii] */
   .hasty = 5e-3,             /* time for which a joint may exceed its speed limit, as light ones do in friction [s] */
@@ -525,22 +526,23 @@ static void fallback_at(const orthocas_arm *arm, const double *q, const void *ga
 ORTHOCAS_API int orthocas_check_settings(const orthocas_arm *arm, const orthocas_safety *safety) {
   const double *infinite[] = {safety->start_mismatch, safety->command_rate,    safety->speed_limit,
                               safety->stuck_speed,    safety->reference_speed, safety->reference_acceleration,
-                              safety->friction};
+                              safety->friction,       safety->contact_torque};
   const double *finite[] = {safety->rest_speed,   safety->stop_stiffness, safety->observer_rate, safety->stop_zone,
                             safety->stop_damping, safety->brake_yield,    safety->encoder_step};
   const double *of_quantities[] = {safety->offset_rate, safety->integral_rate, safety->integral_limit};
   const double positive[] = {safety->near_margin,  safety->catch_margin,   safety->return_margin,
                              safety->fade_in,      safety->fade_out,       safety->return_speed,
-                             safety->damping,      safety->longest_period, safety->brake_stiffness};
+                             safety->damping,      safety->longest_period, safety->brake_stiffness,
+                             safety->energy_rate};
   const double any = INFINITY, most = arm->numbers.largest;
   const int n = arm->n, torque = arm->torque;
   int good = all_from(-any, safety->lower, n, any) && all_from(-any, safety->upper, n, any);
-  for (int i = 0; i < (torque ? 7 : 6); ++i) good = good && all_from(0.0, infinite[i], n, any);
+  for (int i = 0; i < (torque ? 8 : 6); ++i) good = good && all_from(0.0, infinite[i], n, any);
   for (int i = 0; i < (torque ? 7 : 2); ++i) good = good && all_from(0.0, finite[i], n, most);
   for (int i = 0; i < 3; ++i) good = good && all_from(0.0, of_quantities[i], arm->k, most);
   return good && all_from(0.0, safety->error_limit, arm->k, any) &&
-         all_from(arm->numbers.smallest, positive, torque ? 9 : 8, most) && safety->hold_ticks >= 0 &&
-         safety->stale_ticks >= 0 && safety->catch_margin < safety->near_margin &&
+         all_from(arm->numbers.smallest, positive, torque ? 10 : 8, most) && (!torque || safety->energy_limit > 0.0) &&
+         safety->hold_ticks >= 0 && safety->stale_ticks >= 0 && safety->catch_margin < safety->near_margin &&
          safety->near_margin < safety->return_margin && safety->return_margin < 1.0;
 }
 
@@ -798,12 +800,21 @@ static int stops_clear(const orthocas_arm *arm, const orthocas_state *state, dou
   return clear;
 }
 
+/* R33: whether a joint feels more than contact_torque beside its load. R34: or commands gave the arm more energy than
+ * energy_limit and energy_rate allow: that bounds what it gives to all it touches, wherever its reference moves. */
+static int touches(const orthocas_arm *arm, const orthocas_state *state) {
+  int touch = arm->torque && state->energy > state->safety->energy_limit;
+  for (int i = 0; i < arm->n && arm->torque; ++i)
+    touch = touch || fabs(state->touch[i] + state->load[i]) > state->safety->contact_torque[i];
+  return touch;
+}
+
 /* R12: who commands, by the table of modes. law: its status. Joints may be fast for 5 ms, which 10 ms give back. */
 static void choose_mode(const orthocas_arm *arm, orthocas_state *state, int law, double clear, double room,
                         const double *error, double period, int late, double *work) {
   const orthocas_safety *safety = state->safety;
   const int hurry = hurries(arm, state, period), fast = hurry && state->hasty >= rules.hasty;
-  const int ready = works(law) && room >= safety->return_margin;
+  const int ready = works(law) && room >= safety->return_margin, touch = touches(arm, state);
   double *speed = take(&work, arm->n);
   for (int i = 0; i < arm->n; ++i) speed[i] = clipped(state->dq[i], safety->speed_limit[i]);
   state->hasty = hurry ? fmin(state->hasty + period, rules.hasty) : fmax(0.0, state->hasty - 0.5 * period);
@@ -813,11 +824,13 @@ static void choose_mode(const orthocas_arm *arm, orthocas_state *state, int law,
              !stops_clear(arm, state, work))
       catch_arm(arm, state, ORTHOCAS_OUTSIDE_DOMAIN);
     else if (fast) catch_arm(arm, state, ORTHOCAS_TOO_FAST);
+    else if (touch) catch_arm(arm, state, ORTHOCAS_TOUCHED);
     else if (late) catch_arm(arm, state, ORTHOCAS_LATE);
   }
   if (state->mode == ORTHOCAS_HOLD) copy(state->anchor, state->q, arm->n);
-  if (state->mode == ORTHOCAS_RETURN && fast) catch_arm(arm, state, ORTHOCAS_TOO_FAST);
-  if (state->asked && !late && !faster_than(arm, state->dq, safety->rest_speed, 1.0)) {
+  if (state->mode == ORTHOCAS_RETURN && (fast || touch))
+    catch_arm(arm, state, fast ? ORTHOCAS_TOO_FAST : ORTHOCAS_TOUCHED);
+  if (state->asked && !late && !touch && !faster_than(arm, state->dq, safety->rest_speed, 1.0)) {
     if (!ready) state->mode = ORTHOCAS_RETURN;
     else if (state->mode != ORTHOCAS_RETURN || !faster_than(arm, state->dq, safety->rest_speed, rules.nearly))
       release_arm(arm, state, error);
@@ -1012,19 +1025,24 @@ static double stop_at(const orthocas_safety *safety, int i, double q, double dq)
 
 /* R20: learn the load, the torque that holds the arm beside the fallback: what the momentum gained since the last tick,
  * less what was commanded and is not the model's, shows. A blow counts no more than the largest command; where the load
- * drives a fast arm instead of holding it, there is less of it. period: 0 where the last tick is not known. */
+ * drives an arm that is fast or touches something, instead of holding it, there is less of it. period: 0 where the last
+ * tick is not known. */
 static void learn_load(const orthocas_arm *arm, orthocas_state *state, const double *M, double period, double *work) {
   const double *dq = state->dq;
-  const int drives = state->mode != ORTHOCAS_LAW && faster_than(arm, dq, state->safety->rest_speed, 1.0);
-  double *gained = take(&work, arm->n);
+  const int fast = faster_than(arm, dq, state->safety->rest_speed, 1.0) || touches(arm, state);
+  double *gained = take(&work, arm->n), given = 0.0;
   for (int i = 0; i < arm->n; ++i) state->speed[i] = dq[i] - state->speed[i];
   multiply(M, state->speed, gained, arm->n);
   for (int i = 0; i < arm->n && period > 0.0; ++i) {
     const double felt = clipped(gained[i] / period - state->drive[i], state->limit[i]);
     double load = state->load[i] - rules.learning * period * (felt + state->load[i]);
-    if (drives && load * dq[i] > 0.0) load *= 1.0 - rules.giving;
+    if (state->mode != ORTHOCAS_LAW && fast && load * dq[i] > 0.0) load *= 1.0 - rules.giving;
     state->load[i] = fabs(load) <= arm->numbers.largest ? clipped(load, rules.lifted * state->limit[i]) : 0.0;
+    state->touch[i] += fmin(rules.touching * period, 1.0) * (felt - state->touch[i]);
+    given += state->drive[i] * (dq[i] - 0.5 * state->speed[i]);
   }
+  given = state->energy + (given - state->safety->energy_rate) * period;
+  state->energy = fmin(fmax(given, 0.0), arm->numbers.largest); /* 0 for NaN */
   copy(state->speed, dq, arm->n);
 }
 
@@ -1181,16 +1199,12 @@ ORTHOCAS_API void orthocas_resume(orthocas_state *state) {
 /* R26: brakes hold the arm at q (HOLD), or do so no more (CATCHER). Nothing that was felt or remembered holds on. */
 ORTHOCAS_API void orthocas_stand(const orthocas_arm *arm, orthocas_state *state, int mode, const double *q,
                                  const double *command) {
+  double *forgotten[] = {state->dq,          state->impulse,  state->expected, state->momentum,
+                         state->unexplained, state->load,     state->touch};
   const int n = arm->n, seen = is_position(arm, q);
   for (int i = 0; i < n && seen; ++i) state->q[i] = unturned(arm, state, i, q[i]);
-  set_zero(state->dq, n);
-  set_zero(state->impulse, n);
-  if (arm->torque) {
-    set_zero(state->expected, n);
-    set_zero(state->unexplained, n);
-    set_zero(state->momentum, n);
-    set_zero(state->load, n);
-  }
+  for (int i = 0; i < (arm->torque ? 7 : 2); ++i) set_zero(forgotten[i], n);
+  state->energy = 0.0;
   if (arm->memory > 0) copy(state->memory, arm->memory_start, arm->memory);
   copy(state->anchor, state->q, n);
   take_command(arm, state, command);

@@ -29,7 +29,8 @@ enum {
   ORTHOCAS_LATE = 10,
   ORTHOCAS_HELD = 11,
   ORTHOCAS_STOPPED_EARLY = 12,
-  ORTHOCAS_LOAD_MISMATCH = 13
+  ORTHOCAS_LOAD_MISMATCH = 13,
+  ORTHOCAS_TOUCHED = 14
 };
 enum { ORTHOCAS_LAW = 0, ORTHOCAS_CATCHER = 1, ORTHOCAS_RETURN = 2, ORTHOCAS_HOLD = 3 };
 
@@ -144,12 +145,12 @@ typedef struct {
 typedef struct {
   const double *command_rate, *speed_limit, *rest_speed, *stuck_speed;            /* (n,) */
   const double *reference_speed, *reference_acceleration, *start_mismatch;        /* (n,) */
-  const double *friction, *encoder_step;                                          /* (n,), null for velocity laws */
+  const double *friction, *encoder_step, *contact_torque;                         /* (n,), null for velocity laws */
   const double *lower, *upper, *stop_stiffness;                                   /* (n,) */
   const double *observer_rate, *stop_zone, *stop_damping, *brake_yield;           /* (n,), null for velocity laws */
   const double *error_limit, *offset_rate, *integral_rate, *integral_limit;       /* (k,) */
   double near_margin, catch_margin, return_margin, fade_in, fade_out, return_speed, longest_period, damping;
-  double brake_stiffness; /* torque laws */
+  double brake_stiffness, energy_limit, energy_rate; /* torque laws */
   int hold_ticks, stale_ticks;
 } orthocas_safety;
 
@@ -157,10 +158,10 @@ typedef struct {
 typedef struct {
   int mode, cause;
   int asked, bad_ticks, fresh, stale_ticks, same_ticks;
-  double weight, brake, unseen, hasty;
+  double weight, brake, unseen, hasty, energy;
   double *q, *dq, *seen_q, *seen_dq, *command, *led, *impulse, *impulse_from, *law, *anchor, *safe, *limit; /* (n,) */
   double *offset, *integral;                                                                                /* (k,) */
-  double *load, *drive, *speed, *expected, *unexplained, *momentum, *trend;  /* (n,), null for velocity laws */
+  double *load, *drive, *speed, *expected, *unexplained, *momentum, *trend, *touch; /* (n,), null for velocity laws */
   double *inertia;                                                           /* (n, n), null for velocity laws */
   double *memory;                                                            /* (memory,) or null */
   orthocas_reference reference;
