@@ -134,7 +134,11 @@ def read_urdf_xml(path: str | Path) -> ElementTree.Element:
         if missing:
             where = "expected beside the package of the file, or in a folder of ROS_PACKAGE_PATH"
             raise RobotError(f"{path} needs the ROS package '{missing[1]}', {where}") from None
-        raise RobotError(f"xacro cannot expand {path}: {type(error).__name__}: {one_line(str(error))[:300]}") from None
+        wanted = (
+            "; give it its arguments yourself: xacro FILE NAME:=VALUE > arm.urdf" if "rgument" in str(error) else ""
+        )
+        cause = f"{type(error).__name__}: {one_line(str(error))[:300]}{wanted}"
+        raise RobotError(f"xacro cannot expand {path}: {cause}") from None
     return _parse_xml(text.encode(), path, "URDF", "robot")
 
 

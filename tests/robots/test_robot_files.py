@@ -122,8 +122,11 @@ def test_xacro_files_find_the_packages_beside_their_own_and_name_those_that_are_
     path.write_text(f'<robot name="a" {XACRO}>{include}</robot>')
     (tmp_path / "parts_test_package" / "urdf" / "part.xacro").write_text(ARM_XACRO)
     assert oc.Robot.from_file(path).joint_names == ("b_joint", "c_joint")
-    path.write_text(path.read_text().replace("parts_test", "lost_test"))
-    with pytest.raises(RobotError, match=r"arm\.urdf\.xacro needs the ROS package 'lost_test_package', expected beside"):
+    path.write_text(f'<robot name="a" {XACRO}><link name="$(arg side)"/></robot>')
+    with pytest.raises(RobotError, match=r"argument side; give it its arguments yourself: xacro FILE NAME:=VALUE >"):
+        oc.Robot.from_file(path)
+    path.write_text(f'<robot name="a" {XACRO}>{include.replace("parts_test", "lost_test")}</robot>')
+    with pytest.raises(RobotError, match=r"xacro needs the ROS package 'lost_test_package', expected beside"):
         oc.Robot.from_file(path)
 
 
