@@ -28,7 +28,7 @@ queueMicrotask(() => {
   // counts by how few pages have it; one that no page has does not count. A page that has most of them comes before text.
   const named = query => {
     const {docnames, filenames, titles, indexentries} = Search._index, asked = split(query);
-    const guide = number => /^(how-to|tutorials|explanation|reference|policies)/.test(docnames[number]);
+    const guide = number => /^(how-to|tutorials|explanation|reference|policies|which_tool)/.test(docnames[number]);
     const entries = titles.map((title, number) => guide(number) ? [split(title)] : []);
     for (const [entry, spots] of Object.entries(indexentries))
       for (const [number, , main] of spots) if (main && guide(number)) entries[number].push(split(entry));

@@ -88,7 +88,10 @@ def format_report_rows(report: "Report", chart: "Chart") -> dict[str, str]:
             f"of the branch {chart.notes['branch']}: leaks of tens of degrees are normal; judge it by conditioning, by "
             "'xi held', and by the regular share of its fit"
         )
-    elif report.length_ratio > _UNEVEN:
+        return rows
+    if report.folded_samples:
+        rows["folded"] += "; fit with --domain auto, which looks for a box without folds"
+    if report.length_ratio > _UNEVEN:
         rows["lengths"] += "; for use in controllers, fit with --weights 1000,30,150,1,1000"
     return rows
 

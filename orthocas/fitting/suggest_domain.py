@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from orthocas.bases.cyclic import cyclic_joints
 from orthocas.bases.family import Parametrisation, require_parametrisation
 from orthocas.charts.point_quality import worst_points
-from orthocas.errors import DomainError, InvalidValueError
+from orthocas.errors import DomainError, InvalidValueError, MetricError
 from orthocas.fitting.fit import Fit, fit_from
 from orthocas.fitting.probe import RULES, Bounds, Miss, Prober, Quality, describe_conditioning, evaluate_chart
 from orthocas.fitting.settings import choose_parametrisation
@@ -276,7 +276,13 @@ class WidestBox:
         self._fraction += (until - self._fraction) / max(2, trials)
         self._next = until, trials - 1
         self.monitor(Progress(_STAGE, self._fraction, detail))
-        return self.prober.evaluate(Box(self.home, widths), enough, leap)
+        try:
+            return self.prober.evaluate(Box(self.home, widths), enough, leap)
+        except MetricError:
+            # Links without mass turn freely where their axes are parallel. A box around a regular posture ends there.
+            if widths[self.free].max() < RULES.smallest:
+                raise
+            return Quality(0.0, 1.0, self.home, task_value=0.0, turn_value=1.0)
 
     def _clip(self, widths: Array) -> Array:
         clipped = self.room.copy()

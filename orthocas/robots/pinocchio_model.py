@@ -372,13 +372,21 @@ def find_default_tip(model: pin.Model) -> str:
         raise RobotError("the robot has no movable joint, expected at least one")
     # The first of the longest chains, with a word about the others.
     longest = max(ends, key=lambda i: (len(model.supports[i]), -i))
+    moving = [i for i in model.supports[longest] if i and model.joints[i].nv == 1]
     names = {i: _list_ends(model, i) for i in ends}
     if len(ends) > 1:
         listing = "; ".join(", ".join(names[i]) for i in ends if i != longest)
-        taken = f"tip='{names[longest][0]}', with {len(model.supports[longest]) - 1} joints, the longest"
+        taken = f"tip='{names[longest][0]}', with {len(moving)} joints, the longest"
         chains = f"the robot has {len(ends)} chains; taken is {taken}. Other tips to name: {listing}"
         warnings.warn(chains, TipWarning, stacklevel=2)
     return names[longest][0]
+
+
+def find_floating_base(model: pin.Model, tips: Sequence[str]) -> list[str]:
+    """Joints with six degrees of freedom that carry the first joints on the way to the tips."""
+    chains = [model.supports[model.frames[find_frame(model, tip)].parentJoint] for tip in tips]
+    roots = {chain[1] for chain in chains if len(chain) > 2}
+    return [model.names[i] for i in sorted(roots) if model.joints[i].shortname() == "JointModelFreeFlyer"]
 
 
 def _carries_fingers(model: pin.Model, i: int) -> bool:

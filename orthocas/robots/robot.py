@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from os import PathLike
@@ -27,6 +28,7 @@ from orthocas.robots.pinocchio_model import (
     build_planar,
     build_tree,
     find_default_tip,
+    find_floating_base,
     find_frame,
     lock_joints,
     lock_off_chain,
@@ -48,6 +50,8 @@ from orthocas.tools.checks import (
 )
 from orthocas.tools.display import Shown, listed, number_list
 from orthocas.tools.expressions import WRITTEN_OUT
+
+_log = logging.getLogger(__name__)
 
 Locked = Mapping[str, float] | None  #: joint -> position at which it is locked [rad] or [m]
 Tool = ArrayLike | None
@@ -211,8 +215,13 @@ class Robot(Shown):
     ) -> Self:
         """The robot of the joints that move the tips, without those that the user locks."""
         tips = tips or (find_default_tip(model),)
-        # First what the user locks, then all that moves no tip.
-        chain = lock_off_chain(lock_joints(model, locked or {}, mimics), *tips, mimics=mimics)
+        # First what the user locks and a base that floats in the file, then all that moves no tip.
+        model = lock_joints(model, locked or {}, mimics)
+        if (floating := find_floating_base(model, tips)) and base is None:
+            joint = floating[0]
+            _log.warning("the base floats in the file (joint '%s') and is held: base='floating' lets it move", joint)
+        model = lock_joints(model, dict.fromkeys(floating, 0.0))
+        chain = lock_off_chain(model, *tips, mimics=mimics)
         tree = build_tree(chain, *tips, base=base, mimics=mimics)
         robot = cls(tree, read_model_postures(chain, tree.joint_names))
         robot = robot if gravity is None else robot.with_gravity(gravity)

@@ -4,6 +4,7 @@ import logging
 import math
 import os
 import re
+import sys
 import tempfile
 from collections.abc import Mapping, Sequence
 from contextlib import suppress
@@ -114,20 +115,37 @@ def read_urdf_xml(path: str | Path) -> ElementTree.Element:
     if Path(path).suffix.lower() != ".xacro":
         return read_xml(path, "URDF", "robot")
     read_xml(path, "xacro")
-    # xacrodoc finds packages in the folders above the file; xacro alone comes with ROS.
+    # xacrodoc finds packages above and beside that of the file; xacro alone comes with ROS.
     name = next((name for name in ("xacrodoc", "xacro") if find_spec(name) is not None), None)
     if name is None:
         raise RobotError(f"{path} is a xacro file, which xacro expands first: pip install 'orthocas[xacro]'")
     expander: Any = import_module(name)
     try:
         if name == "xacrodoc":
+            beside = _find_packages_beside(Path(path).resolve())
+            if beside:
+                expander.packages.look_in(beside, priority=sys.maxsize)  # after what the user and ROS name
             text = expander.XacroDoc.from_file(str(path)).to_urdf_string()
         else:
             text = expander.process_file(str(path)).toxml()
     # Files raise whatever their expressions do.
     except (Exception, SystemExit) as error:
-        raise RobotError(f"xacro cannot expand {path}: {type(error).__name__}: {one_line(str(error))[:300]}") from None
+        missing = re.search(r"[Pp]ackage not found: (\S+)", str(error))
+        if missing:
+            where = "expected beside the package of the file, or in a folder of ROS_PACKAGE_PATH"
+            raise RobotError(f"{path} needs the ROS package '{missing[1]}', {where}") from None
+        wanted = (
+            "; give it its arguments yourself: xacro FILE NAME:=VALUE > arm.urdf" if "rgument" in str(error) else ""
+        )
+        cause = f"{type(error).__name__}: {one_line(str(error))[:300]}{wanted}"
+        raise RobotError(f"xacro cannot expand {path}: {cause}") from None
     return _parse_xml(text.encode(), path, "URDF", "robot")
+
+
+def _find_packages_beside(path: Path) -> list[str]:
+    """Folders of the ROS packages that lie in the same folder as the package of a file."""
+    root = next((folder for folder in path.parents if (folder / "package.xml").exists()), None)
+    return [] if root is None else [str(found.parent) for found in sorted(root.parent.glob("*/package.xml"))]
 
 
 def read_xml(path: str | Path, kind: str, tag: str | None = None) -> ElementTree.Element:

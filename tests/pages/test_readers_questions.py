@@ -1,11 +1,15 @@
-"""Ten questions that newcomers ask, each with the page and the sentence that answer it; some by the site's search."""
+"""Ten questions that newcomers ask, each with the page and the sentence that answer it, and the site's search."""
 
+import json
 import re
+import shutil
+import subprocess
 from pathlib import Path
 
 import pytest
 
 DOCS = Path(__file__).parents[2] / "docs"
+SITE = DOCS.parent / "build" / "docs"  #: what `make docs` has built
 ANSWERS = {
     "How do I keep the elbow up?": (
         "how-to/elbow",
@@ -91,6 +95,73 @@ SEARCHED = {
     "closed chain": "explanation/limits",
     "mimic joint": "explanation/limits",
 }
+#: words that are no entry of the index as they stand
+TYPED = {
+    "7 dof inverse kinematics": "how-to/inverse",
+    "admittance control": "how-to/interfaces",
+    "arduino": "how-to/c_code",
+    "c code generation": "how-to/c_code",
+    "call from julia": "how-to/c_code",
+    "cartesian path planning": "how-to/paths",
+    "center of mass": "how-to/casadi_dynamics",
+    "chart folds over": "how-to/certify",
+    "citation": "reference/references",
+    "collision checking": "how-to/collisions",
+    "compare with other methods": "which_tool",
+    "compiler not found": "how-to/install",
+    "custom task": "how-to/tasks",
+    "drake": "how-to/coming_from",
+    "emergency stop": "how-to/stops",
+    "fit takes too long": "explanation/how_a_fit_runs",
+    "gazebo": "how-to/coming_from",
+    "gym environment": "how-to/learning",
+    "how do I keep the elbow up": "how-to/elbow",
+    "how to install": "how-to/install",
+    "IKFast": "how-to/arm",
+    "imitation learning": "how-to/learning",
+    "joint limit avoidance": "how-to/limits",
+    "julia": "how-to/c_code",
+    "keep elbow up": "how-to/elbow",
+    "kinova gen3": "how-to/ready_charts",
+    "kuka iiwa": "how-to/robots",
+    "license": "policies",
+    "linear rail": "how-to/mobile_base",
+    "load chart": "reference/files",
+    "matlab": "how-to/c_code",
+    "mobile robot": "how-to/mobile_base",
+    "model predictive control": "how-to/optimal_control",
+    "null space control": "explanation/projectors",
+    "null space projection": "how-to/coming_from",
+    "operational space control": "explanation/projectors",
+    "orthogonality": "explanation/angles",
+    "parallel gripper": "tutorials/own_arm",
+    "passivity": "explanation/control",
+    "payload": "how-to/wrong_model",
+    "pip install orthocas": "how-to/install",
+    "pybullet": "how-to/coming_from",
+    "python bindings": "reference/api",
+    "qp": "how-to/qp",
+    "record motion": "how-to/paths",
+    "reinforcement learning": "how-to/learning",
+    "RRT": "how-to/planning",
+    "rviz": "how-to/view",
+    "simulink": "how-to/c_code",
+    "slow fit": "explanation/how_a_fit_runs",
+    "so101": "tutorials/own_arm",
+    "spacemouse": "how-to/joystick",
+    "swivel angle": "how-to/elbow",
+    "teleoperation": "how-to/joystick",
+    "tip frame": "tutorials/own_arm",
+    "torque control": "explanation/control",
+    "trajectory optimization": "how-to/paths",
+    "visual servoing": "how-to/pointing",
+    "visualize robot": "how-to/view",
+    "what is a chart": "explanation/ideas",
+    "what is leak": "explanation/angles",
+    "what is xi": "explanation/ideas",
+    "whole body control": "explanation/limits",
+    "windows install": "how-to/install",
+}
 
 
 @pytest.mark.parametrize("question", ANSWERS)
@@ -103,6 +174,20 @@ def test_a_page_answers(question: str) -> None:
 def test_the_search_finds_the_page_among_the_first_three(words: str) -> None:
     """Sphinx ranks main entries of the index (!) first, above titles and text."""
     assert [page for page, entries in index().items() if words.lower() in entries][:3] == [SEARCHED[words]]
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(shutil.which("node") is None, reason="no node")
+def test_the_search_of_the_built_site_finds_each_page_first() -> None:
+    """By the site's own code and index, as a browser runs them."""
+    found, newest = SITE / "searchindex.js", max(path.stat().st_mtime for path in DOCS.rglob("*.md"))
+    if not found.exists() or found.stat().st_mtime < newest:
+        pytest.skip("no site of these pages: make docs")
+    wanted = SEARCHED | TYPED
+    program = ["node", Path(__file__).with_name("ask_site.js"), SITE]
+    done = subprocess.run(program, input="\n".join(wanted), capture_output=True, text=True, check=True, timeout=60)
+    first = {words: pages[:1] for words, pages in zip(wanted, json.loads(done.stdout), strict=True)}
+    assert first == {words: [page] for words, page in wanted.items()}
 
 
 def index() -> dict[str, list[str]]:

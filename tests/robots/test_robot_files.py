@@ -112,6 +112,24 @@ def test_xacro_files_are_expanded_if_their_name_says_so(tmp_path: Path) -> None:
         oc.Robot.from_file(path)
 
 
+def test_xacro_files_find_the_packages_beside_their_own_and_name_those_that_are_missing(tmp_path: Path) -> None:
+    """As in a workspace of ROS: one package has the arm, another one its parts."""
+    for name in ("arm_test_package", "parts_test_package"):
+        (tmp_path / name / "urdf").mkdir(parents=True)
+        (tmp_path / name / "package.xml").write_text(f"<package><name>{name}</name></package>")
+    include = '<xacro:include filename="$(find parts_test_package)/urdf/part.xacro"/>'
+    path = tmp_path / "arm_test_package" / "urdf" / "arm.urdf.xacro"
+    path.write_text(f'<robot name="a" {XACRO}>{include}</robot>')
+    (tmp_path / "parts_test_package" / "urdf" / "part.xacro").write_text(ARM_XACRO)
+    assert oc.Robot.from_file(path).joint_names == ("b_joint", "c_joint")
+    path.write_text(f'<robot name="a" {XACRO}><link name="$(arg side)"/></robot>')
+    with pytest.raises(RobotError, match=r"argument side; give it its arguments yourself: xacro FILE NAME:=VALUE >"):
+        oc.Robot.from_file(path)
+    path.write_text(f'<robot name="a" {XACRO}>{include.replace("parts_test", "lost_test")}</robot>')
+    with pytest.raises(RobotError, match=r"xacro needs the ROS package 'lost_test_package', expected beside"):
+        oc.Robot.from_file(path)
+
+
 def test_xacro_files_without_xacro_say_what_to_install(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "arm.xacro"
     path.write_text(ARM_XACRO)

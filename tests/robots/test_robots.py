@@ -245,7 +245,10 @@ def test_locked_joint_on_the_way_to_the_tip_stays_where_it_is() -> None:
     np.testing.assert_allclose(locked.tip_position(rest), free.tip_position(q), atol=1e-12)
 
 
-def test_floating_base_on_the_way_is_locked_by_zero(tmp_path: Path) -> None:
+def test_floating_base_of_a_file_is_held_where_the_file_puts_it(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    """As files of humanoids have it for MuJoCo; with base='floating' it moves."""
     path = tmp_path / "humanoid.xml"
     path.write_text(
         """<mujoco><worldbody><body name="trunk" pos="0 0 1"><freejoint name="root"/>
@@ -257,8 +260,12 @@ def test_floating_base_on_the_way_is_locked_by_zero(tmp_path: Path) -> None:
         <body name="b"><joint name="ball" type="ball"/><geom type="sphere" size="0.1" mass="1"/></body>
         </body></worldbody></mujoco>"""
     )
-    with pytest.raises(RobotError, match=r"'root' .*6 degrees of freedom.*locked=\{'root': 0.0\} or --lock root=0"):
-        oc.Robot.from_file(path, "hand")
+    robot = oc.Robot.from_file(path, "hand")
+    assert "the base floats in the file (joint 'root') and is held: base='floating' lets it move" in caplog.text
+    assert robot.joint_names == ("j1", "j2")
+    np.testing.assert_allclose(robot.tip_position([np.pi / 2, 0.3]), [0, 1, 1], atol=1e-12)
+    caplog.clear()
+    assert oc.Robot.from_file(path, "hand", base="floating").n == 8
     with pytest.raises(
         RobotError, match="locked position of joint 'root' is 0.5, expected 0: .*only be locked at its neutral"
     ):
