@@ -46,7 +46,7 @@ class CollisionRules:
 
     tolerance: float = 1e-10  #: of distances of separate solids, relative to them; overlaps keep coal's 1e-6
     iterations: int = 1000  #: of the search for them
-    deepening: int = 255  #: iterations of the search for the depth of an overlap, which 64 leave at 1e-5 for round solids
+    deepening: int = 255  #: of the search for depths of overlaps; 64 leave 1e-5 m between round solids
     piece: int = 256  #: postures whose bounds are computed at once
     first: int = 24  #: pairs with the nearest balls, of which bounds by capsules are computed first
     slack: float = 2e-6  #: of lower bounds [m]
