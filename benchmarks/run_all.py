@@ -55,6 +55,7 @@ SCRIPTS = (
     "exported_nearest",
     "beyond_reach",
     "collisions",
+    "collisions_in_mujoco",
     "arm",
     "all_solutions",
     "arm_batches",

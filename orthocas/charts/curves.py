@@ -90,6 +90,25 @@ class SelfMotionCurves:
                 found.append(self._solve(targets, np.zeros(len(guess), dtype=np.int64), guess, tolerance)[0])
         return np.concatenate(found)
 
+    def list_points(self, target: Array, parts: int) -> Array:
+        """Points (K, n) in the domain on all curves of x that are found, at most `RULES.step / parts` apart.
+
+        Curves are sought from positions near a target (n,) of phi. Joints turn within their ranges by full turns, and
+        those without a range within half a turn of the domain's home, or one and a half where turns change xi.
+        """
+        own, found = self.boxed.domain.home[None], [np.empty((0, len(target)))]
+        starts = np.concatenate(self.stages(target[None], own))
+        with np.errstate(all="ignore"):
+            for traces in self._trace_all(target[None], starts):
+                # without the ends of steps, with which the next ones begin
+                q, t = (part[:, :-1].reshape(-1, len(target)) for part in self._steps(traces, own).divided(parts))
+                x = np.broadcast_to(target[: self.boxed.m], (len(q), self.boxed.m))
+                for _ in range(RULES.corrections):
+                    q = q + self.tracer.correct(x, q, t)[0]
+                q = q[np.isfinite(q).all(axis=1)]
+                found.append(q[self.boxed.domain.contains(q)])
+        return np.concatenate(found)
+
     def _trace_all(self, targets: Array, starts: Array) -> Iterator[Traces]:
         """The curves of one target (1, n) to which starts (S, 1, n) lead, one after the other."""
         row = np.zeros(1, dtype=np.int64)
@@ -471,9 +490,9 @@ class Steps:
         """Points of some steps (K,) at shares of the way (K,), on cubic curves, (K, n)."""
         return _on_cubics(self.q[steps], self.tangent[steps], share[:, None])[:, 0]
 
-    def divided(self) -> tuple[Array, Array]:
-        """`RULES.parts` + 1 points on each step, on cubic curves, and directions there, (S, parts + 1, n) each."""
-        s = np.broadcast_to(np.arange(RULES.parts + 1) / RULES.parts, (len(self.q), RULES.parts + 1))
+    def divided(self, parts: int = RULES.parts) -> tuple[Array, Array]:
+        """`parts` + 1 points on each step, on cubic curves, and directions there, (S, parts + 1, n) each."""
+        s = np.broadcast_to(np.arange(parts + 1) / parts, (len(self.q), parts + 1))
         along = (1 - s[:, :, None]) * self.tangent[:, :1] + s[:, :, None] * self.tangent[:, 1:]
         return _on_cubics(self.q, self.tangent, s), along
 

@@ -18,7 +18,7 @@ from orthocas.errors import InvalidValueError, PathError, SolveError
 from orthocas.paths.joint_curve import JointCurve, LostCurve, PhiSolver, TimeLaw, compute_fastest_law, list_places
 from orthocas.paths.joint_motion import JointMotion, Margins
 from orthocas.paths.tool_path import RULES, ToolPath, build_spline
-from orthocas.paths.xi_search import search_xi
+from orthocas.paths.xi_search import XiSearch
 from orthocas.robots.collisions import Collisions
 from orthocas.robots.tree import require_driven
 from orthocas.tasks.samples import compute_row_scale, sample_uniform
@@ -143,9 +143,8 @@ def _choose_xi(
     if limits.collisions is None or chart.r > 1:
         return
     for clearance in (limits.clearance + RULES.away, limits.clearance):
-        found = search_xi(
-            chart, path, limits.collisions, clearance, Costs(replace(limits, collisions=None)).sum_squares
-        )
+        cost = Costs(replace(limits, collisions=None)).sum_squares
+        found = XiSearch(solver, path, limits.collisions, clearance, cost).find()
         if found is None:
             continue
         s, q = found

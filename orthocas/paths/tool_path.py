@@ -58,9 +58,9 @@ class PathRules:
     away: float = 0.02  #: distance of a pair: scale of its residual [m]
     nearest: int = 6  #: pairs of parts with such residuals, the nearest ones by the bounds of their capsules
     stations: int = 49  #: of the search of all xi along a path that contacts stop
-    lattice: int = 64  #: values of xi at each station
-    lattice_samples: int = 2000  #: of the domain, by which they are spread
-    lattice_step: float = 0.35  #: longest between stations, of a joint [rad] or [m]
+    station_parts: int = 8  #: of steps along the self-motions there, of up to 0.4 rad or m
+    station_step: float = 0.35  #: longest between stations, of a joint [rad] or [m]
+    station_places: int = 3  #: between stations, at which edges are checked
     too_near: float = 0.004  #: where the line of that residual begins [m]
 
     walk_steps: int = 3  #: at each place

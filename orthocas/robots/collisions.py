@@ -46,6 +46,7 @@ class CollisionRules:
 
     tolerance: float = 1e-10  #: of distances of separate solids, relative to them; overlaps keep coal's 1e-6
     iterations: int = 1000  #: of the search for them
+    deepening: int = 255  #: of the search for depths of overlaps; 64 leave 1e-5 m between round solids
     piece: int = 256  #: postures whose bounds are computed at once
     first: int = 24  #: pairs with the nearest balls, of which bounds by capsules are computed first
     slack: float = 2e-6  #: of lower bounds [m]
@@ -704,6 +705,7 @@ class _Scratch:
         self.data, self.placed = model.createData(), geometry.createData()
         for request in self.placed.distanceRequests:
             request.gjk_tolerance, request.gjk_max_iterations = RULES.tolerance, RULES.iterations
+            request.epa_max_iterations = RULES.deepening
         self._tree, self._order = tree, list(tree.order)
 
     def place(self, q: Array) -> None:

@@ -114,8 +114,8 @@ class BallGeometry(Geometry):
     radius: float
 
     def build(self) -> Any:
-        """The ball."""
-        return coal.Sphere(self.radius)
+        """The ball, as a capsule without a length: of coal's spheres in cylinders, depths are wrong."""
+        return coal.Capsule(self.radius, 0.0)
 
     def list_corners(self) -> tuple[Array, float]:
         """Its centre."""

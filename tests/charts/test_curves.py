@@ -50,6 +50,25 @@ def test_all_solutions_are_those_that_random_starts_find(name: str) -> None:
         np.testing.assert_allclose(chart.phi(found), np.tile(chart.phi(q), (len(found), 1)), atol=1e-8)
 
 
+def test_points_of_all_curves_pass_by_every_posture() -> None:
+    """Of a planar arm, also by those on the other side of a fold, with the same x and xi."""
+    robot = oc.Robot.planar([1.0, 0.8, 0.6], [1.0, 1.0, 1.0])
+    problem = oc.Problem(robot, oc.Task.position(robot, "xy"), "euclidean", oc.Box([0.3, 0.6, 0.6], [2.0, 2.4, 2.4]))
+    chart = oc.fit(problem, oc.Linear(), samples=300).chart
+    curves, folded = chart.parts.inverse.curves, 0
+    assert curves is not None
+    for q in problem.domain.sample(12, 5):
+        points = curves.list_points(chart.phi(q), 8)
+        assert problem.domain.contains(points).all()
+        np.testing.assert_allclose(chart.x(points), np.tile(chart.x(q), (len(points), 1)), atol=1e-9)
+        # steps of curves are at most 0.4 rad long
+        assert np.linalg.norm(points - q, axis=1).min() < 0.06
+        solutions = chart.solutions(chart.phi(q))
+        folded += len(solutions) > 1
+        assert all(np.linalg.norm(points - other, axis=1).min() < 0.06 for other in solutions)
+    assert folded > 3
+
+
 @pytest.mark.slow
 def test_few_random_starts_lead_to_a_nearer_xi_where_curves_fill_surfaces() -> None:
     """With r = 2, slices show most of the self-motions: of 800 wishes, 4,000 starts led nearer in one of a hundred."""

@@ -12,6 +12,7 @@ import certificates
 import clear_positions
 import collision_scenes
 import collisions
+import collisions_in_mujoco
 import compare_parametrisations
 import contact
 import distillation
@@ -359,6 +360,13 @@ def test_benchmark_of_collisions_agrees_with_coal_and_touches_nothing() -> None:
     assert found["panda, ratio"] < 1.6
     assert found["panda, contacts"] == 0
     assert found["panda, nearest [m]"] > 0.01 - 1e-6
+
+
+@pytest.mark.nightly
+def test_benchmark_of_collisions_agrees_with_mujoco() -> None:
+    found = collisions_in_mujoco.main(quick=True)
+    assert found["panda, URDF, deep"] == 0
+    assert found["panda, URDF, apart [m]"] < 1e-7
 
 
 @pytest.mark.slow

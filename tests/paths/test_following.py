@@ -20,6 +20,7 @@ from orthocas.paths import JointMotion
 from orthocas.paths.follow import Costs, MotionLimits, XiChoice, walk
 from orthocas.paths.joint_curve import JointCurve, PhiSolver
 from orthocas.paths.tool_path import ToolPath
+from orthocas.paths.xi_search import XiSearch
 from orthocas.robots.collisions import Collisions
 from orthocas.robots.obstacles import Sphere
 from orthocas.tools.checks import Array
@@ -282,6 +283,36 @@ def test_objective_goes_round_obstacles() -> None:
     assert nearest >= 0.01 - 1e-4
     assert found.margins.distance == pytest.approx(nearest, abs=1e-3)
     assert "'ball'" in found.margins.distance_pair
+
+
+@pytest.mark.parametrize("closed", [False, True])
+def test_a_search_finds_a_clear_way_or_none(closed: bool) -> None:
+    """Between its stations too; a closed path ends with the posture with which it begins."""
+    chart = planar()
+    points = loop(chart, 0.1)[: None if closed else 40]
+    path = ToolPath.hold(chart, points, chart.xi(START))
+    held = JointCurve.trace(solver := PhiSolver(chart), path.phi, START)
+    assert isinstance(held, JointCurve)
+    # A ball on the way of the elbow, whose xi is held.
+    elbow = chart.robot.joint_points(held.q(np.array([0.4])))[0, 2]
+    around = put_ball(chart.robot, elbow.tolist(), 0.05, 0.02)
+    cost = Costs(_limits(chart)).sum_squares
+    found = XiSearch(solver, path, around, 0.01, cost).find()
+    assert found is not None
+    s, q = found
+    assert path.closed == closed
+    np.testing.assert_allclose(chart.x(q), path.x(s), atol=1e-8)
+    if closed:
+        np.testing.assert_array_equal(q[-1], q[0])
+    dense = np.linspace(0.0, 1.0, 1000)
+    goals = np.hstack([path.x(dense), np.interp(dense, s, chart.xi(q)[:, 0])[:, None]])
+    way = solver.solve(np.column_stack([np.interp(dense, s, column) for column in q.T]), goals)
+    assert chart.problem.domain.contains(way).all()
+    assert around.distance(way).distance.min() > 0.005
+    assert around.distance(held.q(dense)).distance.min() < 0
+    # A ball that no posture gets around.
+    everywhere = put_ball(chart.robot, [0.0, 0.0, 0.0], 1.5, 0.02)
+    assert XiSearch(solver, path, everywhere, 0.01, cost).find() is None
 
 
 @pytest.mark.slow

@@ -103,6 +103,21 @@ def test_distances_from_scenes_have_closed_forms_and_gradients(kind: str, tmp_pa
     assert np.quantile(errors, 0.5) < 1e-6
 
 
+def test_depths_of_balls_in_cylinders_have_a_closed_form(tmp_path: Path) -> None:
+    """A ball whose centre is inside: out through the curved face or the nearer end, whichever is shorter."""
+    robot = build_arm(tmp_path, ["", BALL, '<cylinder radius="0.5" length="0.6"/>'])
+    turn = oc.obstacles.Sphere([0.0, 0.0, 0.1], 0.2)
+    around = Collisions(robot.tree, robot.collisions.parts, ()).with_scene(oc.Scene({"ball": turn}))
+    q = np.random.default_rng(4).uniform(-3.1, 3.1, (400, 2))
+    centres = np.array([place_balls(position)[2] for position in q])
+    across, along = np.linalg.norm(centres, axis=1) - 0.5, 0.1 - 0.3
+    depth = np.minimum(np.maximum(across, along), 0.0) + np.maximum(across, 0.0) - 0.2
+    found = around.pair_distances(q)[:, around.pairs.index(("link2", "ball"))]
+    assert (across < along).any()
+    assert (across > along).any()
+    np.testing.assert_allclose(found, depth, atol=2e-6)
+
+
 def test_attached_solids_move_with_their_link(tmp_path: Path) -> None:
     robot = build_arm(tmp_path, [BALL, BALL, BALL])
     held = {"box": oc.obstacles.Sphere([1.0, 0.0, 0.0], 0.05)}
