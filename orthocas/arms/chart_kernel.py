@@ -315,7 +315,7 @@ def write_tracker(
         low, high = domain.bounds
         periods, sizes = chart.parts.turns[chart.m :], chart.parts.phi_sizes[chart.m :]
         part = {"low": low, "high": high, "slack": domain.slack, "pivots": pivots, "period": periods, "size": sizes}
-        if rows and (singular := domain.singular_bound) is not None:
+        if rows and chart.r == 1 and (singular := domain.singular_bound) is not None:
             functions.append(dense_function(f"gram_{k}", [q], [singular.gram(q)]))
             part |= {"bound": singular.least_singular_value, "alike": _find_alike(chart)}
         parts.append({"bound": 0.0, "alike": np.zeros(n, dtype=bool), **part})
