@@ -18,11 +18,14 @@ from orthocas.native.curves import RULES as CURVES
 from orthocas.native.kernels import generate_kernels
 from orthocas.native.libraries import keep_library, load_library, pointer
 from orthocas.tasks.regular_box import find_joint_range
+from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.batch import dense_function, run_in_threads
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, Indices
+from orthocas.tools.expressions import wrap_shortest
 
 _FLAGS = ("-O3",)
+_PROBES = 32  # postures at which full turns are tried
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +81,8 @@ class ChartKernelRules:
     same: float = 1e-6  #: [rad] or [m] between postures that are the same
     every: int = 1000  #: postures with x and xi, at most
     lifts: int = 4096  #: combinations of full turns of joints, at most
+    singular_bend: float = 2.0  #: of the least singular value along a curve, its second derivative [1/rad^2]
+    inverse_rounds: int = 3  #: of inverse iteration for it
     bisections: int = 30  #: between two of these points, at most
     halved: int = 3  #: of them, before Newton's method is tried
     curve_starts: int = CURVES.starts  #: of the search of all curves
@@ -295,23 +300,25 @@ def write_tracker(
         postures: stored for each chart, in the code; 0 for none there.
     """
     robot, task, n = maps.robot, maps.task, maps.robot.n
-    equations = maps.equations
+    equations, rows = maps.equations, template != "arm_track.c"
     functions = [equations, build_curvature(equations), maps.target_function]
     parts = []
     # Of each chart: xi and its gradient, and what its domain asks for besides the box.
     for k, chart in enumerate(charts):
         q, own, domain = ca.MX.sym("q", n), chart.coordinates.functions, chart.problem.domain
-        rows = [chart.parts.runnable(own[word])(q) for word in ("xi", "jacobian")]
-        functions.append(dense_function(f"xi_{k}", [q], rows))
+        xi = [chart.parts.runnable(own[word])(q) for word in ("xi", "jacobian")]
+        functions.append(dense_function(f"xi_{k}", [q], xi))
         pivots = 0
         if domain.condition is not None:
             functions.append(dense_function(f"pivots_{k}", [q], [domain.condition.pivots(q)]))
             pivots = functions[-1].numel_out(0)
         low, high = domain.bounds
         periods, sizes = chart.parts.turns[chart.m :], chart.parts.phi_sizes[chart.m :]
-        parts.append(
-            {"low": low, "high": high, "slack": domain.slack, "pivots": pivots, "period": periods, "size": sizes}
-        )
+        part = {"low": low, "high": high, "slack": domain.slack, "pivots": pivots, "period": periods, "size": sizes}
+        if rows and chart.r == 1 and (singular := domain.singular_bound) is not None:
+            functions.append(dense_function(f"gram_{k}", [q], [singular.gram(q)]))
+            part |= {"bound": singular.least_singular_value, "alike": _find_alike(chart)}
+        parts.append({"bound": 0.0, "alike": np.zeros(n, dtype=bool), **part})
     kernels = generate_kernels(functions, f"{name}_kernel")
     size = equations.size1_in(1)
     # How the header describes a target.
@@ -344,8 +351,8 @@ def write_tracker(
     speed = np.where(np.isfinite(robot.velocity_limits), robot.velocity_limits, RULES.speed)
     values |= {"stored": ChartPostures.build(maps, charts, postures) if postures else None, "speed": speed}
     values |= {"window": RULES.window}
-    values["rows"] = template != "arm_track.c"
-    if values["rows"]:
+    values["rows"] = rows
+    if rows:
         values["branches"] = len(maps.stored.begins) if charts and n - task.m == 1 else 0
     if values.get("branches"):
         # Where full turns count: within limits, or without these, in boxes of charts, or where they change xi.
@@ -356,10 +363,19 @@ def write_tracker(
         lift_low = np.where(endless, np.maximum(lows.min(axis=0), around[0]), robot.lower)
         lift_high = np.where(endless, np.minimum(highs.max(axis=0), around[1]), robot.upper)
         # All combinations of full turns find room, so that none is dropped.
-        ranges = np.where(maps.turning, lift_high - lift_low + 2 * RULES.room, 0.0)
+        ranges = np.where(maps.turning, lift_high - lift_low + 2 * RULES.room + CURVES.step, 0.0)
         lifts = np.prod(np.floor(ranges[np.isfinite(ranges)] / (2 * np.pi)) + 1)
         if lifts > RULES.lifts:
             raise InvalidValueError("limits", f"{lifts:.0f} combinations of full turns", f"at most {RULES.lifts}")
         values |= {"lift_low": lift_low, "lift_high": lift_high, "winds": winds, "lifts": int(lifts)}
     source = f"{name}_track.c" if template == "arm_track.c" else f"{name}.c"
     return {f"{name}_track.h": render("arm_track.h", values), source: render(template, values)}
+
+
+def _find_alike(chart: Chart) -> NDArray[np.bool_]:
+    """Revolute joints whose full turns change neither xi nor the condition of a domain on singular values, (n,)."""
+    robot, periods = chart.robot, chart.parts.turns[chart.m :]
+    q = sample_uniform(chart.domain, _PROBES, 0)
+    turned = np.stack([chart.xi(q + 2 * np.pi * row) - chart.xi(q) for row in np.eye(robot.n)])
+    same = np.abs(wrap_shortest(turned, periods)).max(axis=(1, 2)) < RULES.xi_met
+    return np.asarray(same & ~np.array(robot.tree.prismatic))

@@ -1,5 +1,7 @@
 """The search along self-motion curves: what it finds, against random starts, and what its parts promise."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from dense_search import STARTS, positions_at
@@ -7,7 +9,9 @@ from programs import needs_c, nightly
 from public_objects import wide
 
 import orthocas as oc
+from orthocas.charts import motion_kernel
 from orthocas.charts.curves import SelfMotionCurves
+from orthocas.charts.motion_kernel import SearchKernel
 from orthocas.tasks.samples import sample_uniform
 
 FOUND, NEAREST = oc.InverseStatus.FOUND, oc.InverseStatus.NEAREST
@@ -176,3 +180,28 @@ def test_without_a_compiler_answers_are_the_same(name: str, monkeypatch: pytest.
         assert len(found) == len(others)
         for q in found:
             assert np.abs(others - q).max(axis=1).min() < 2e-10
+
+
+@needs_c
+@pytest.mark.slow
+def test_ends_and_turns_beyond_the_room_of_c_count_as_well(monkeypatch: pytest.MonkeyPatch) -> None:
+    """With room for one end of an arc and one combination of full turns, the nearest xi are the same."""
+    chart = oc.load("xarm7-wide")
+    phi, wishes = chart.phi(chart.domain.sample(60, 2)), chart.domain.sample(60, 1)
+    phi[:, chart.m] += np.random.default_rng(4).normal(0.0, 0.7, 60)  # some beyond what the chart has there
+    curves = chart.parts.inverse.curves
+    assert curves is not None
+    roomy = curves.search(phi, wishes, 1e-9)
+    source = motion_kernel.get_source
+
+    def get_narrow(name: str) -> str:
+        text = source(name)
+        for word, room in (("SHEETS", 256), ("ENDS", 64)) if name == "curve_rows.c" else ():
+            assert f"#define {word} {room}\n" in text
+            text = text.replace(f"#define {word} {room}\n", f"#define {word} 1\n")
+        return text
+
+    monkeypatch.setattr(motion_kernel, "get_source", get_narrow)
+    narrow = replace(curves, kernel=SearchKernel(chart)).search(phi, wishes, 1e-9)
+    assert np.unique(roomy.distance > 0).size == 2
+    np.testing.assert_allclose(narrow.distance, roomy.distance, atol=2e-10)

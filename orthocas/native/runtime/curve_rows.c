@@ -93,13 +93,37 @@ static void correct(double *q, const double *target, const double *along) {
   for (i = 0; i < N; ++i) q[i] += change[i];
 }
 
+/* Where an arc leaves the domain. */
+static void take_end(row_search *row, const arc_end *end) {
+  double a[N], b[N];
+  int i, round;
+  memcpy(a, end->inside, sizeof a);
+  memcpy(b, end->outside, sizeof b);
+  for (round = 0; round < 60; ++round) {
+    double along[N], middle[N], width = 0.0, size;
+    for (i = 0; i < N; ++i) {
+      along[i] = b[i] - a[i];
+      middle[i] = (a[i] + b[i]) / 2;
+      width = fmax(width, fabs(along[i]));
+    }
+    if (!(width > ROW_NARROW)) break;
+    size = sqrt(dot(along, along));
+    for (i = 0; i < N; ++i) along[i] /= size;
+    correct(middle, row->target, along);
+    memcpy(contains(middle) ? a : b, middle, sizeof a);
+  }
+  take(row, a, fabs(xi_left(row->target, a)), 0);
+}
+
+/* Keep an end of an arc for later, when most of them are too far; where there is no room, it is looked at now. */
 static void add_end(row_search *row, const double *inside, const double *outside, double least) {
-  arc_end *end = &row->end[row->ends];
-  if (!(least < row->distance) || row->ends == ENDS) return;
-  memcpy(end->inside, inside, sizeof end->inside);
-  memcpy(end->outside, outside, sizeof end->outside);
-  end->least = least;
-  ++row->ends;
+  arc_end end;
+  if (!(least < row->distance)) return;
+  memcpy(end.inside, inside, sizeof end.inside);
+  memcpy(end.outside, outside, sizeof end.outside);
+  end.least = least;
+  if (row->ends < ENDS) row->end[row->ends++] = end;
+  else take_end(row, &end);
 }
 
 /* An arc between a and b, which lie outside: chords that pass the box are halved. */
@@ -121,28 +145,6 @@ static void take_short(row_search *row, const double *a, const double *b, int le
     take_short(row, a, q, level + 1, slack / 4);
     take_short(row, q, b, level + 1, slack / 4);
   }
-}
-
-/* Where an arc leaves the domain. */
-static void take_end(row_search *row, const arc_end *end) {
-  double a[N], b[N];
-  int i, round;
-  memcpy(a, end->inside, sizeof a);
-  memcpy(b, end->outside, sizeof b);
-  for (round = 0; round < 60; ++round) {
-    double along[N], middle[N], width = 0.0, size;
-    for (i = 0; i < N; ++i) {
-      along[i] = b[i] - a[i];
-      middle[i] = (a[i] + b[i]) / 2;
-      width = fmax(width, fabs(along[i]));
-    }
-    if (!(width > ROW_NARROW)) break;
-    size = sqrt(dot(along, along));
-    for (i = 0; i < N; ++i) along[i] /= size;
-    correct(middle, row->target, along);
-    memcpy(contains(middle) ? a : b, middle, sizeof a);
-  }
-  take(row, a, fabs(xi_left(row->target, a)), 0);
 }
 
 /* A point on the cubic of a step after full turns, and the direction there. */
@@ -235,9 +237,10 @@ static void search_sheet(row_search *row, const node *curve, int count, const do
   }
 }
 
-/* Look for the target on a curve after all full turns that bring points of it near the box. */
+/* Look for the target on a curve after all full turns that bring points of it near the box; where there is no room to keep
+ * them, at once, and then some more than once. */
 static void search_curve(row_search *row, const node *curve, int points) {
-  double sheets[SHEETS][N], lowest_before[N], highest_before[N];
+  double sheets[SHEETS + 1][N], lowest_before[N], highest_before[N];
   int count = 0, p, i, s, fresh = 1;
   for (p = 0; p < points; ++p) {
     double lowest[N], highest[N], turns[N];
@@ -268,9 +271,11 @@ static void search_curve(row_search *row, const node *curve, int points) {
         for (i = 0; i < N; ++i) equal = equal && sheets[s][i] == TURN * turns[i];
         if (equal) break;
       }
-      if (s == count && count < SHEETS) {
-        for (i = 0; i < N; ++i) sheets[count][i] = TURN * turns[i];
-        ++count;
+      if (s == count) {
+        double *sheet = sheets[count < SHEETS ? count++ : SHEETS];
+        for (i = 0; i < N; ++i) sheet[i] = TURN * turns[i];
+        if (s == SHEETS) search_sheet(row, curve, points, sheet);
+        if (!(row->distance > 0.0)) return;
       }
       for (i = 0; i < N && turns[i] >= highest[i]; ++i) turns[i] = lowest[i];
       if (i == N) break;
