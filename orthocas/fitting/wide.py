@@ -100,18 +100,18 @@ def fit_wide(
     1. Under a whole pose or orientation, families without the last joint come first. If the first one can turn fully,
        families without both come before these. Then xi stays while base or tool turn about their own axes: full turns
        close, and rolling the hand moves no other joint. With r = 1, these are networks,
-       MLP((24, 24, 24), raw=True, activation="isru"): they lean less into the task than polynomials, but have no proof in
-       a useful time. With several coordinates or `like`, they are polynomials, linear in the first joint. A family is
-       kept if it leaves out little of the branch after all rounds of 4. Where the first result leaves out more than a
-       tenth, 3 follows.
+       MLP((24, 24, 24), raw=True, activation="isru"): they lean less into the task than polynomials, but have no
+       proof in a useful time. With several coordinates or `like`, they are polynomials, linear in the first joint. A
+       family is kept if it leaves out little of the branch after all rounds of 4. Where the first result leaves out
+       more than a tenth, 3 follows.
     2. Polynomials that are linear in each joint on whose position self-motions do not depend, such as the first and the
        last one, descend with L-BFGS from linear coordinates across the task at the centre of the branch. They are best
        to prove, and hold at any turn of these joints. They ask that self-motions turn base and tool in one direction.
     3. If these leave out much of the branch, polynomials in all joints are tried, and a network,
        MLP((64, 64, 64), raw=True, activation="isru"), where both leave out much, or the first ones very much, as on
-       arms whose axes pass each other at a distance. A network begins at random, or with the result of A = I in another metric with r = 1,
-       and descends with Adam on some of the samples at a time. It takes several times as long to evaluate, and is not
-       tried with `like` or with slides without limits.
+       arms whose axes pass each other at a distance. A network begins at random, or with the result of A = I in
+       another metric with r = 1, and descends with Adam on some of the samples at a time. It takes several times as
+       long to evaluate, and is not tried with `like` or with slides without limits.
     4. The best ones go on: as long as they are not regular enough at other samples, and get better, the worst of many
        fresh samples join. Once they are, leaks weigh more in a last descent, kept if coordinates stay regular enough.
 

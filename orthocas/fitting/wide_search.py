@@ -31,6 +31,10 @@ from orthocas.tools.interrupts import deferred
 from orthocas.tools.progress import Monitor, Watch, silent
 
 
+_NETWORK = MLP((64, 64, 64), raw=True, activation="isru")
+_SMALL_NETWORK = MLP((24, 24, 24), raw=True, activation="isru")
+
+
 @dataclass(frozen=True, slots=True)
 class WideRules:
     """Numbers of wide fits. Chosen on iiwa and panda, held on eight arms."""
@@ -38,8 +42,8 @@ class WideRules:
     clearance: float = 0.1  #: default least relative singular value of the task
     degree: int = 6  #: of polynomials that are linear in base and tool joints
     degree_of_all: int = 5  #: of polynomials in which these count like all others
-    network: MLP = MLP((64, 64, 64), raw=True, activation="isru")  #: where polynomials leave out much
-    small_network: MLP = MLP((24, 24, 24), raw=True, activation="isru")  #: without some of the joints
+    network: MLP = _NETWORK  #: where polynomials leave out much
+    small_network: MLP = _SMALL_NETWORK  #: without some of the joints
 
     alignment: float = 0.3  #: weight of the mean sin^2 of the leaks
     alignment_in_metric: float = 1.0  #: the same in another metric than the identity

@@ -138,7 +138,10 @@ def test_graph_cut_into_blocks_gives_the_same_loss(planar_x: oc.Problem, monkeyp
     np.testing.assert_allclose(blocked.value_and_gradient(family.initial(1))[1], gradient, atol=1e-11)
 
 
-@pytest.mark.parametrize("network", [oc.MLP((7,)), oc.MLP((6, 5, 4)), oc.MLP((6, 5, 4), raw=True, activation="isru")], ids=lambda p: p.label)
+NETWORKS = [oc.MLP((7,)), oc.MLP((6, 5, 4)), oc.MLP((6, 5, 4), raw=True, activation="isru")]
+
+
+@pytest.mark.parametrize("network", NETWORKS, ids=lambda p: p.label)
 def test_arrays_of_a_network_agree_with_its_graph(problem: oc.Problem, network: oc.MLP) -> None:
     """Derivatives by hand against CasADi's, for 40 samples and for 260 in pieces of 130; single precision to 1e-5."""
     family = network.family(JointSpace.of(problem), problem.r)

@@ -331,7 +331,12 @@ def test_the_first_families_leave_out_the_turn_of_the_tool_and_of_a_base_that_tu
         (iiwa(), "euclidean", None, ["mlp:24x24x24:raw:isru:without=A7"]),
         (iiwa(), "inertia", None, ["mlp:24x24x24:raw:isru:without=A7"]),
         (iiwa(), "euclidean", "swivel", ["polynomial:6:cyclic=A1:without=A7"]),
-        (endless, "euclidean", None, ["mlp:24x24x24:raw:isru:without=j1,j7", "mlp:24x24x24:raw:isru:cyclic=j1:without=j7"]),
+        (
+            endless,
+            "euclidean",
+            None,
+            [f"mlp:24x24x24:raw:isru:{rest}" for rest in ("without=j1,j7", "cyclic=j1:without=j7")],
+        ),
     ):
         task = oc.Task.pose(robot)
         problem = oc.Problem(robot, task, metric, regular_box(robot, task))
