@@ -30,7 +30,6 @@ from orthocas.tools.checks import Array
 from orthocas.tools.interrupts import deferred
 from orthocas.tools.progress import Monitor, Watch, silent
 
-
 _NETWORK = MLP((64, 64, 64), raw=True, activation="isru")
 _SMALL_NETWORK = MLP((24, 24, 24), raw=True, activation="isru")
 
