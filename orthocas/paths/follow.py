@@ -153,7 +153,10 @@ def _choose_xi(
         xi = counted_on(chart.xi(q), chart.parts.turns[chart.m :])
         if path.closed:
             xi[-1] = xi[0]
-        yield path.replace_xi(build_spline(s, xi, path.closed)), q[0]
+        # Straight between the stations, as the search has checked: a spline through these alone swings out.
+        places = np.linspace(0.0, 1.0, (len(s) - 1) * (RULES.station_places + 1) + 1)
+        straight = np.column_stack([np.interp(places, s, column) for column in xi.T])
+        yield path.replace_xi(build_spline(places, straight, path.closed)), q[0]
 
 
 def _move(path: ToolPath, curve: JointCurve | LostCurve, limits: MotionLimits, period: float) -> JointMotion:
