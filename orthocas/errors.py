@@ -2,6 +2,8 @@
 
 import difflib
 import math
+import sys
+import warnings
 from collections.abc import Iterable
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
@@ -80,6 +82,14 @@ class BranchWarning(UserWarning):
 
 class TipWarning(UserWarning):
     """A robot has several chains, and no tip was named."""
+
+
+def warn_caller(text: str, category: type[Warning]) -> None:
+    """Warn with the line outside this package that led here, however deep the call is."""
+    level, frame = 1, sys._getframe()
+    while frame.f_back is not None and str(frame.f_globals.get("__name__")).split(".")[0] == "orthocas":
+        level, frame = level + 1, frame.f_back
+    warnings.warn(text, category, stacklevel=level)
 
 
 class ShapeError(OrthocasError, ValueError):

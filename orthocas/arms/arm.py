@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from importlib.resources import as_file, files
@@ -22,7 +21,7 @@ from orthocas.charts.clearance import Clearance
 from orthocas.charts.inverse import InverseStatus
 from orthocas.charts.ready import load, names
 from orthocas.codegen.generate import require_free_folder, require_name
-from orthocas.errors import BranchWarning, DomainError, InvalidValueError, NotRedundantError, ShapeError
+from orthocas.errors import BranchWarning, DomainError, InvalidValueError, NotRedundantError, ShapeError, warn_caller
 from orthocas.fitting.wide import fit_wide
 from orthocas.robots.collisions import Collisions
 from orthocas.robots.robot import Robot
@@ -202,7 +201,7 @@ class Arm(Shown):
             except DomainError as error:
                 reasons.append(str(error))
         for reason in reasons if found else ():
-            warnings.warn(reason, BranchWarning, stacklevel=2)
+            warn_caller(reason, BranchWarning)
         if not found:
             raise DomainError(f"no branch can be fitted: {listed(reasons)}")
         return cls(bare.task, tuple(found))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import warnings
 from collections.abc import Callable, Mapping
 from dataclasses import asdict, dataclass, fields, is_dataclass
 from typing import Any, cast
@@ -14,7 +13,7 @@ from orthocas.bases.family import Parametrisation
 from orthocas.bases.given import SEW, Given, SEWKind
 from orthocas.bases.mlp import ACTIVATIONS, MLP
 from orthocas.bases.products import JOINTS, Fourier, Linear, Polynomial
-from orthocas.errors import InvalidValueError, NotSavableWarning
+from orthocas.errors import InvalidValueError, NotSavableWarning, warn_caller
 from orthocas.tools.checks import require_kind, require_known
 
 
@@ -75,7 +74,7 @@ def warn_unless_savable(parametrisation: Parametrisation) -> None:
     try:
         parametrisation_to_data(parametrisation)
     except InvalidValueError as error:
-        warnings.warn(f"charts of this fit cannot be saved: {error}", NotSavableWarning, stacklevel=3)
+        warn_caller(f"charts of this fit cannot be saved: {error}", NotSavableWarning)
 
 
 def parametrisation_to_data(parametrisation: Parametrisation) -> dict[str, Any]:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import ClassVar, Literal, Self, get_args
@@ -54,7 +53,7 @@ from orthocas.control.linear_algebra import (
 )
 from orthocas.control.memory import MEMORIES, Memory, Remembers
 from orthocas.control.run_time_model import UNITS, Gravity, RunTimeModel, Source
-from orthocas.errors import InvalidValueError, LawWarning
+from orthocas.errors import InvalidValueError, LawWarning, warn_caller
 from orthocas.robots.robot import Robot
 from orthocas.robots.tree import require_driven
 from orthocas.tasks.metric import Metric
@@ -230,7 +229,7 @@ class _OperationalSpace(LawOfChart):
         if coupling == "decoupled" and (metric := chart.problem.metric.name) != "inertia":
             doubts.append(f"a decoupled law relies on A = M (inertia), but the metric of this chart is {metric}")
         for doubt in doubts:
-            warnings.warn(doubt, LawWarning, stacklevel=2)
+            warn_caller(doubt, LawWarning)
 
     @classmethod
     def _choose_springs(

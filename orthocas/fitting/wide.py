@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 import time
-import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
@@ -28,7 +27,7 @@ from orthocas.charts.chart_file import FREE
 from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.point_quality import worst_points
 from orthocas.charts.regular_part import RegularPart
-from orthocas.errors import BranchWarning, DomainError, Interrupted, InvalidValueError
+from orthocas.errors import BranchWarning, DomainError, Interrupted, InvalidValueError, warn_caller
 from orthocas.fitting.fit import Fit, fix_gauge, normalise
 from orthocas.fitting.like import Like, Likeness, MeaningError, choose_quantities, take_exactly
 from orthocas.fitting.terms import Weights, find_least_volume, find_term
@@ -230,7 +229,7 @@ def fit_wide(
         if result.status is Status.INTERRUPTED or pressed():
             raise Interrupted(result)
     if result.left_out:
-        warnings.warn(f"the chart of branch '{chosen.name}' leaves out {result.left_out}", BranchWarning, stacklevel=2)
+        warn_caller(f"the chart of branch '{chosen.name}' leaves out {result.left_out}", BranchWarning)
     return result
 
 

@@ -2,14 +2,13 @@
 
 import logging
 import re
-import warnings
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 import pinocchio as pin
 
-from orthocas.errors import InvalidValueError, RobotError, TipWarning, degrees_hint
+from orthocas.errors import InvalidValueError, RobotError, TipWarning, degrees_hint, warn_caller
 from orthocas.robots.spatial import rotate_z_to, snap
 from orthocas.robots.tree import BASE_JOINTS, JointKind, KinematicTree, place_on_base
 from orthocas.tools.checks import Array, freeze_array, require_known
@@ -378,7 +377,7 @@ def find_default_tip(model: pin.Model) -> str:
         listing = "; ".join(", ".join(names[i]) for i in ends if i != longest)
         taken = f"tip='{names[longest][0]}', with {len(moving)} joints, the longest"
         chains = f"the robot has {len(ends)} chains; taken is {taken}. Other tips to name: {listing}"
-        warnings.warn(chains, TipWarning, stacklevel=2)
+        warn_caller(chains, TipWarning)
     return names[longest][0]
 
 

@@ -16,6 +16,7 @@ from orthocas.bases.family import JointSpace
 from orthocas.charts.quality import evaluate
 from orthocas.errors import DomainError, InvalidValueError, NotRedundantError, SingularTaskError, UnknownNameError
 from orthocas.fitting.probe import Prober, compute_leak_and_conditioning, evaluate_chart
+from orthocas.tasks.metric import Metric
 from orthocas.tasks.regular_box import find_home
 from orthocas.tasks.samples import evaluate_samples, sample_boundary_weighted
 from orthocas.tools.progress import Progress
@@ -298,3 +299,14 @@ def test_box_is_searched_with_the_weights_of_the_fit(planar_xy: oc.Problem) -> N
         assert found.fit.chart.notes["angles"] == angles
         boxes[angles] = found.domain.half_width[1:].prod()
     assert boxes["metric"] > 1.1 * boxes["paper"]  # it asks for the leak, which the box is bounded by
+
+
+@pytest.mark.slow
+def test_box_ends_where_the_metric_is_no_longer_positive() -> None:
+    """Just beyond the box that the search begins with, as where links without mass turn freely."""
+    robot, task = planar()
+    end = 1.59
+    metric = Metric.custom(robot, "ends", lambda q: ca.diag(ca.vertcat(1, 1, ca.if_else(q[2] < end, 1, -1))))
+    found = oc.suggest_domain(robot, task, HOME, metric, parametrisation=oc.Polynomial(2))
+    assert found.joints[2].reason == "singularity"
+    assert found.problem.domain.half_width[2] < end - HOME[2]

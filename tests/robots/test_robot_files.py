@@ -81,8 +81,10 @@ def test_unknown_frame_and_joint_list_what_exists() -> None:
     ],
 )
 def test_longest_arm_of_a_branching_robot_is_taken(name: str, tip: str, joints: int, others: str) -> None:
-    with pytest.warns(TipWarning, match=rf"taken is tip='{tip}', with {joints} joints.*Other tips to name: .*{others}"):
+    told = rf"taken is tip='{tip}', with {joints} joints.*Other tips to name: .*{others}"
+    with pytest.warns(TipWarning, match=told) as seen:
         robot = oc.Robot.from_name(name)
+    assert seen[0].filename == __file__  # the caller's line, not one inside the package
     assert (robot.tips, robot.n) == ((tip,), joints)
 
 
