@@ -94,7 +94,7 @@ class XiSearch:
             x = self.path.x((1 - share) * s[rows] + share * s_later[rows])
             goals = np.hstack([x, xi[rows] + share * change[rows]])
             found = self.solver.solve(q[rows] + share * steps[rows], goals)
-            good: Flags = np.asarray(np.isfinite(found).all(axis=1))
+            good = np.asarray(np.isfinite(found).all(axis=1))
             good[good] = chart.problem.domain.contains(found[good])
             good[good] = self._check_clear(found[good])
             kept[rows[~good]] = False
