@@ -8,6 +8,7 @@ from threading import local
 from typing import Any
 
 import casadi as ca
+import coal
 import numpy as np
 import pinocchio as pin
 from numpy.typing import ArrayLike
@@ -200,7 +201,7 @@ class Collisions(Shown):
             scratch.place(position)
             # Of all parts of a pair, the least distance; bounds save nothing where every distance is asked for.
             for k, owner in enumerate(self._owners.tolist()):
-                found = pin.computeDistance(scratch.geometry, scratch.placed, k).min_distance
+                found = scratch.measure(k).min_distance
                 row[owner] = min(row[owner], found)
         return values[0] if single else values
 
@@ -217,7 +218,7 @@ class Collisions(Shown):
                 scratch.place(some[i])
                 near = np.flatnonzero(bounds[i] <= 0)
                 for k in near[np.argsort(bounds[i][near])].tolist():
-                    if pin.computeDistance(scratch.geometry, scratch.placed, k).min_distance <= 0:
+                    if scratch.measure(k).min_distance <= 0:
                         free[start + i] = False
                         break
         return bool(free[0]) if single else free
@@ -371,7 +372,7 @@ class Collisions(Shown):
             scratch.place(points[i])
             distances: dict[int, float] = {}
             for k in np.flatnonzero(bounds[i] < least).tolist():
-                found = pin.computeDistance(scratch.geometry, scratch.placed, k).min_distance
+                found = scratch.measure(k).min_distance
                 owner = int(self._owners[k])
                 distances[owner] = min(found, distances.get(owner, np.inf))
             yield from ((owner, found) for owner, found in distances.items() if found < least)
@@ -406,7 +407,7 @@ class Collisions(Shown):
         scratch.place(q)
         values, ends, normals = np.empty(len(index)), np.empty((len(index), 2, 3)), np.empty((len(index), 3))
         for row, k in enumerate(index.tolist()):
-            result = pin.computeDistance(scratch.geometry, scratch.placed, k)
+            result = scratch.measure(k)
             values[row], normals[row] = result.min_distance, result.normal
             ends[row, 0], ends[row, 1] = result.getNearestPoint1(), result.getNearestPoint2()
         # Of point clouds, coal has the cloud first.
@@ -466,7 +467,7 @@ class Collisions(Shown):
             scratch = self._scratch
             scratch.place(a + s * (b - a))
             for k in pairs[np.isnan(values[pairs])].tolist():
-                values[k] = pin.computeDistance(scratch.geometry, scratch.placed, k).min_distance
+                values[k] = scratch.measure(k).min_distance
             return values[pairs]
 
         while waiting:
@@ -520,7 +521,6 @@ class Collisions(Shown):
         """Evaluate pairs at R of the points (N, n), in orders (R, k), until bounds (R, K) are above what is found."""
         values, index, ends, normals = found
         scratch = self._scratch
-        geometry, placed = scratch.geometry, scratch.placed
         sorted_bounds = np.take_along_axis(bounds, orders, axis=1).tolist()
         for row, order, own in zip(rows.tolist(), orders.tolist(), sorted_bounds, strict=True):
             scratch.place(points[row])
@@ -529,11 +529,11 @@ class Collisions(Shown):
             for bound, k in zip(own, order, strict=True):
                 if bound >= least:
                     break
-                distance = pin.computeDistance(geometry, placed, k).min_distance
+                distance = scratch.measure(k).min_distance
                 if distance < least:
                     least, nearest = distance, k
             if nearest >= 0:
-                result = placed.distanceResults[nearest]
+                result = scratch.placed.distanceResults[nearest]
                 values[row], index[row], normals[row] = least, nearest, result.normal
                 ends[row, 0], ends[row, 1] = result.getNearestPoint1(), result.getNearestPoint2()
 
@@ -706,12 +706,24 @@ class _Scratch:
         for request in self.placed.distanceRequests:
             request.gjk_tolerance, request.gjk_max_iterations = RULES.tolerance, RULES.iterations
             request.epa_max_iterations = RULES.deepening
+            request.gjk_initial_guess = coal.GJKInitialGuess.CachedGuess
+        self._requests, self._guess, self._corners = (
+            list(self.placed.distanceRequests),
+            np.eye(3)[0],
+            np.zeros(2, np.int32),
+        )
         self._tree, self._order = tree, list(tree.order)
 
     def place(self, q: Array) -> None:
         """Place all solids at joint positions (n,)."""
         positions = self._tree.expand(q)[self._order] if self._tree.mimic_names else q
         pin.updateGeometryPlacements(self.model, self.data, self.geometry, self.placed, positions)
+
+    def measure(self, k: int) -> Any:
+        """The distance of pair k as placed: each search begins alike, so that results do not depend on earlier ones."""
+        request = self._requests[k]
+        request.cached_gjk_guess, request.cached_support_func_guess = self._guess, self._corners
+        return pin.computeDistance(self.geometry, self.placed, k)
 
 
 def _cross(a: Array, b: Array) -> Array:
