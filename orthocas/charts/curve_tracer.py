@@ -35,6 +35,7 @@ class CurveRules:
     known: float = 0.05  #: distance [rad] or [m] from a curve up to which a start lies on it
     parts: int = 3  #: points with xi on each step
     corrections: int = 2  #: Newton's steps from such points to x
+    last_correction: float = 1e-3  #: largest last one of them [rad] or [m]
     sagitta: float = 6e-3  #: largest distance of those parts from their chords [rad] or [m]
     halvings: int = 5  #: of chords that pass the box between points outside
     narrow: float = 1e-10  #: [rad] or [m]: brackets of an end of the domain

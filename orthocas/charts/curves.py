@@ -104,8 +104,10 @@ class SelfMotionCurves:
                 q, t = (part[:, :-1].reshape(-1, len(target)) for part in self._steps(traces, own).divided(parts))
                 x = np.broadcast_to(target[: self.boxed.m], (len(q), self.boxed.m))
                 for _ in range(RULES.corrections):
-                    q = q + self.tracer.correct(x, q, t)[0]
-                q = q[np.isfinite(q).all(axis=1)]
+                    move = self.tracer.correct(x, q, t)[0]
+                    q = q + move
+                # where the last move was long, or none, x is not reached
+                q = q[np.abs(move).max(axis=1, initial=0.0) < RULES.last_correction]
                 found.append(q[self.boxed.domain.contains(q)])
         return np.concatenate(found)
 

@@ -59,6 +59,7 @@ class PathRules:
     nearest: int = 6  #: pairs of parts with such residuals, the nearest ones by the bounds of their capsules
     stations: int = 49  #: of the search of all xi along a path that contacts stop
     station_parts: int = 8  #: of steps along the self-motions there, of up to 0.4 rad or m
+    station_postures: int = 300  #: of a station at most
     station_step: float = 0.35  #: longest between stations, of a joint [rad] or [m]
     station_places: int = 3  #: between stations, at which edges are checked
     too_near: float = 0.004  #: where the line of that residual begins [m]

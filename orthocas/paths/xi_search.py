@@ -19,10 +19,11 @@ class XiSearch:
     """Searches all xi along a tool path for a way that is clear of contacts, r = 1.
 
     Of all postures on the self-motions of a station, 0.05 rad or m apart, in the domain and clear, one is chosen at
-    every station: the sum of the costs of postures and of the squared steps between them is least, by dynamic
-    programming. Between stations, no joint moves by more than `RULES.station_step`, and det J keeps its sign, so the
-    postures do not pass a fold. Where the way between two stations is not clear or leaves the domain, all edges between
-    them are checked, and the next best way is sought. Closed paths end with the posture with which they begin.
+    every station, of at most `RULES.station_postures`, evenly thinned: the sum of the costs of postures and of the
+    squared steps between them is least, by dynamic programming. From station to station, no joint moves by more than
+    `RULES.station_step`, and det J has the same sign. Where the way between two stations is not clear or leaves the
+    domain, all edges between them are checked, and the next best way is sought. Closed paths end with the posture with
+    which they begin.
 
     Source:
         ours; the recursion is Viterbi's, and edges are checked late as in lazy planners.
@@ -46,11 +47,15 @@ class XiSearch:
         while (chosen := _find_cheapest(costs, edges, closed)) is not None:
             way = np.array([q[k] for q, k in zip(stations, chosen, strict=True)])
             blocked = np.flatnonzero(~self._check_between(s[:-1], s[1:], way[:-1], way[1:]))
-            if not set(blocked.tolist()) - checked:
+            if not len(blocked):
                 # Joints that turn without end go on from one station to the next.
                 way[:, self._endless] = np.unwrap(way[:, self._endless], axis=0)
                 return s, way
             for k in blocked:
+                if k in checked:
+                    # rounding alone can block an edge that was clear
+                    edges[k][chosen[k], chosen[k + 1]] = np.inf
+                    continue
                 i, j = np.nonzero(np.isfinite(edges[k]))
                 bad = ~self._check_between(
                     np.full(len(i), s[k]), np.full(len(i), s[k + 1]), stations[k][i], stations[k + 1][j]
@@ -70,8 +75,14 @@ class XiSearch:
         chart = self.solver.chart
         curves = chart.parts.inverse.curves
         assert curves is not None
-        q = curves.list_points(np.append(x, chart.xi(chart.problem.domain.home)), RULES.station_parts)
-        return q[self._check_clear(q)]
+        home = chart.problem.domain.home
+        q = curves.list_points(np.append(x, chart.xi(home)), RULES.station_parts)
+        # joints that turn without end count once, and memory grows with the square of the number, or its cube
+        q = q[(np.abs(q - home)[:, self._endless] <= np.pi).all(axis=1)]
+        q = q[self._check_clear(q)]
+        return (
+            q[np.linspace(0, len(q) - 1, RULES.station_postures).astype(int)] if len(q) > RULES.station_postures else q
+        )
 
     def _check_clear(self, q: Array) -> Flags:
         return np.asarray(self.collisions.distance(q).distance > self.clearance, dtype=bool)

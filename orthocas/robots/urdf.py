@@ -6,13 +6,15 @@ import os
 import re
 import sys
 import tempfile
-from collections.abc import Mapping, Sequence
-from contextlib import suppress
+from collections.abc import Iterator, Mapping, Sequence
+from contextlib import contextmanager, suppress
+from copy import copy
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, files
 from importlib.util import find_spec
 from pathlib import Path
+from threading import Lock
 from typing import Any
 from xml.etree import ElementTree
 
@@ -25,6 +27,7 @@ from orthocas.tools.checks import Array
 from orthocas.tools.display import listed
 
 _log = logging.getLogger(__name__)
+_PACKAGES = Lock()  #: held while xacrodoc looks for packages, which it does in one place for all
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,6 +107,20 @@ def read_urdf(path: str | Path) -> tuple[pin.Model, dict[str, Mimic]]:
     return model, mimics
 
 
+@contextmanager
+def _own_packages(expander: Any) -> Iterator[None]:
+    """What xacrodoc finds for one file is not kept for others: two workspaces may have packages of one name."""
+    with _PACKAGES:
+        kept = expander.packages._finder
+        own = copy(kept)
+        own.finder_funcs, own.package_cache = list(kept.finder_funcs), dict(kept.package_cache)
+        expander.packages._finder = own
+        try:
+            yield
+        finally:
+            expander.packages._finder = kept
+
+
 def read_urdf_xml(path: str | Path) -> ElementTree.Element:
     """The root element of a URDF file; xacro files, whose names end in .xacro, are run through xacro first.
 
@@ -122,10 +139,12 @@ def read_urdf_xml(path: str | Path) -> ElementTree.Element:
     expander: Any = import_module(name)
     try:
         if name == "xacrodoc":
-            beside = _find_packages_beside(Path(path).resolve())
-            if beside:
-                expander.packages.look_in(beside, priority=sys.maxsize)  # after what the user and ROS name
-            text = expander.XacroDoc.from_file(str(path)).to_urdf_string()
+            with _own_packages(expander):
+                beside = _find_packages_beside(Path(path).resolve())
+                if beside:
+                    # after what the user and ROS name
+                    expander.packages.look_in(beside, priority=sys.maxsize)
+                text = expander.XacroDoc.from_file(str(path)).to_urdf_string()
         else:
             text = expander.process_file(str(path)).toxml()
     # Files raise whatever their expressions do.

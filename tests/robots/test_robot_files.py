@@ -2,6 +2,7 @@
 
 import dataclasses
 import re
+import shutil
 from pathlib import Path
 
 import casadi as ca
@@ -124,6 +125,12 @@ def test_xacro_files_find_the_packages_beside_their_own_and_name_those_that_are_
     path.write_text(f'<robot name="a" {XACRO}>{include}</robot>')
     (tmp_path / "parts_test_package" / "urdf" / "part.xacro").write_text(ARM_XACRO)
     assert oc.Robot.from_file(path).joint_names == ("b_joint", "c_joint")
+    # another workspace has other parts in a package of the same name
+    other = tmp_path / "other"
+    for name in ("arm_test_package", "parts_test_package"):
+        shutil.copytree(tmp_path / name, other / name)
+    (other / "parts_test_package" / "urdf" / "part.xacro").write_text(ARM_XACRO.replace("_joint", "_axis"))
+    assert oc.Robot.from_file(other / path.relative_to(tmp_path)).joint_names == ("b_axis", "c_axis")
     path.write_text(f'<robot name="a" {XACRO}><link name="$(arg side)"/></robot>')
     with pytest.raises(RobotError, match=r"argument side; give it its arguments yourself: xacro FILE NAME:=VALUE >"):
         oc.Robot.from_file(path)

@@ -66,6 +66,28 @@ def test_no_more_energy_than_its_limit_goes_to_what_the_arm_touches(
     assert 0.1 < taken[0.1] <= 0.1 + rate * SECONDS
 
 
+@pytest.mark.slow
+def test_energy_is_what_the_arm_has_when_nothing_takes_any(
+    supervised_library: CompiledLibrary, supervised_law: PDPlus
+) -> None:
+    """Coriolis torques, which move energy from joint to joint, neither give nor take any."""
+    law = supervised_law
+    chart, robot, q = law.chart, law.problem.robot, law.problem.domain.home
+    guard = Supervisor(supervised_library, law, Safety.of(law, energy_rate=1e-9))
+    guard.start(q, robot.gravity(q))
+    plant, reference, given = MuJoCoPlant(robot), at_rest(chart, q), []
+    plant.reset(q)
+    for k in range(400):
+        for i, way in ((chart.m, 0.5), (0, 0.15)):
+            reference[i] += way * np.sin(np.pi * k * TICK / 0.4) * TICK * np.pi
+            reference[chart.n + i] = way * np.sin(np.pi * k * TICK / 0.4) * np.pi
+        plant.step(guard.step(plant.q, plant.dq, reference, TICK)[0], TICK)
+        given.append((guard.energy, 0.5 * plant.dq @ robot.mass_matrix(plant.q) @ plant.dq))
+    energy, moving = np.array(given).T
+    assert moving.max() > 10
+    np.testing.assert_allclose(energy, moving, atol=0.02 * moving.max())
+
+
 def test_settings_of_guards_are_torques_and_energies(supervised_law: PDPlus) -> None:
     assert np.isinf(Safety.of(supervised_law).contact_torque).all()
     assert Safety.of(supervised_law).energy_limit == np.inf

@@ -265,15 +265,15 @@ static void take_vicinity(const orthocas_arm *arm, vicinity *place, double **wor
 /* Errors and rooms at q. */
 static void look_at(const orthocas_arm *arm, const double *q, const double *wanted, vicinity *found) {
   const int n = arm->n, rooms = arm->rooms;
-  double square;
   copy(found->q, q, n);
   for (int k = 0; k < rooms; ++k) found->rooms[k] = 1.0;
   set_zero(found->inwards, rooms * n);
   arm->kernels.near(found->q, wanted, found->e, found->slopes, found->rooms, found->inwards);
-  square = dot(found->e, found->e, n);
-  found->cost = square <= arm->numbers.largest && all_finite(arm, found->slopes, n * n) ? 0.5 * square : -1.0;
-  for (int k = 0; k < rooms * n; ++k)
-    if (!(fabs(found->inwards[k]) <= arm->numbers.largest)) found->inwards[k] = 0.0;
+  found->cost = 0.5 * dot(found->e, found->e, n);
+  if (!(found->cost <= arm->numbers.largest) || !all_finite(arm, found->slopes, n * n)) found->cost = -1.0;
+  for (int k = 0; k < rooms * n; ++k) /* a slope with unknown parts is no direction */
+    if (!(fabs(found->inwards[k]) <= arm->numbers.largest))
+      for (int i = 0; i < n; ++i) found->inwards[i * rooms + k % rooms] = 0.0;
 }
 
 /* The d with the least g d + d H d / 2 of those with low <= rows d <= high, by a primal active set from d = 0. The first
@@ -470,7 +470,7 @@ ORTHOCAS_API int orthocas_control(const orthocas_arm *arm, const double *q, cons
  * | mode    | who commands             | goes to | when                                                                |
  * | ------- | ------------------------ | ------- | ------------------------------------------------------------------- |
  * | LAW     | the law, faded in        | CATCHER | it does not work here; the boundary is near or will be in fade_out; |
- * |         |                          |         | a joint is too fast; a tick is late; hold_ticks without measurement |
+ * |         |                          |         | a joint is too fast, or touches; late; hold_ticks blind             |
  * | CATCHER | fallback, load, damping, | LAW     | resume was asked, the arm is slow, the law works, and there is room |
  * |         | and a spring             | RETURN  | resume was asked, the arm is slow, but there is no room             |
  * | RETURN  | the catcher, its anchor  | LAW     | the arm is nearly at rest, the law works, and there is room         |
@@ -1023,11 +1023,11 @@ static double stop_at(const orthocas_safety *safety, int i, double q, double dq)
   return 0.0;
 }
 
-/* R20: learn the load, the torque that holds the arm beside the fallback: what the momentum gained since the last tick,
- * less what was commanded and is not the model's, shows. A blow counts no more than the largest command; where the load
- * drives an arm that is fast or touches something, instead of holding it, there is less of it. period: 0 where the last
- * tick is not known. */
-static void learn_load(const orthocas_arm *arm, orthocas_state *state, const double *M, double period, double *work) {
+/* R20: learn the load, the torque that holds the arm beside the fallback: what the momentum gained in a period (0: not
+ * known), less what was commanded and is not the model's, shows. A blow counts no more than the largest command; where
+ * the load drives an arm that is fast or touches something, instead of holding it, there is less of it. */
+static void learn_load(const orthocas_arm *arm, orthocas_state *state, const double *M, double period,
+                       const double *fallback, double *work) {
   const double *dq = state->dq;
   const int fast = faster_than(arm, dq, state->safety->rest_speed, 1.0) || touches(arm, state);
   double *gained = take(&work, arm->n), given = 0.0;
@@ -1038,11 +1038,11 @@ static void learn_load(const orthocas_arm *arm, orthocas_state *state, const dou
     double load = state->load[i] - rules.learning * period * (felt + state->load[i]);
     if (state->mode != ORTHOCAS_LAW && fast && load * dq[i] > 0.0) load *= 1.0 - rules.giving;
     state->load[i] = fabs(load) <= arm->numbers.largest ? clipped(load, rules.lifted * state->limit[i]) : 0.0;
-    state->touch[i] += fmin(rules.touching * period, 1.0) * (felt - state->touch[i]);
-    given += state->drive[i] * (dq[i] - 0.5 * state->speed[i]);
+    const double touch = state->touch[i] + fmin(rules.touching * period, 1.0) * (felt - state->touch[i]);
+    state->touch[i] = fabs(touch) <= arm->numbers.largest ? touch : 0.0;
+    given += (state->command[i] - fallback[i]) * (dq[i] - 0.5 * state->speed[i]);
   }
-  given = state->energy + (given - state->safety->energy_rate) * period;
-  state->energy = fmin(fmax(given, 0.0), arm->numbers.largest); /* 0 for NaN */
+  state->energy = fmin(fmax(state->energy + (given - state->safety->energy_rate) * period, 0.0), arm->numbers.largest);
   copy(state->speed, dq, arm->n);
 }
 
@@ -1057,7 +1057,7 @@ static void compose_torque(const orthocas_arm *arm, orthocas_state *state, doubl
   const double damping = safety->damping * fmax(1.0 - state->weight, fmin(fmax(near, 0.0), 1.0));
   double *spring = take(&work, arm->n), *wanted = take(&work, arm->n), *moved = take(&work, arm->n);
   (void)orthocas_dynamics(arm, q, dq, M, bias, gravity);
-  learn_load(arm, state, M, period, work);
+  learn_load(arm, state, M, period, fallback, work);
   brake_at(arm, state, M, spring, work);
   for (int i = 0; i < arm->n; ++i) wanted[i] = stop_at(safety, i, q[i], dq[i]) - damping * dq[i];
   multiply(M, wanted, moved, arm->n);
@@ -1300,7 +1300,7 @@ ORTHOCAS_API int orthocas_step(const orthocas_arm *arm, orthocas_state *state, i
   double *shared = take(&work, arm->shared), *measured = take(&work, k), *change = take(&work, k);
   double *error = take(&work, k), *law = take(&work, n), *fallback = take(&work, n), *here = take(&work, n);
   double *speed = take(&work, n), *M = take(&work, n * n), *bias = take(&work, n), *gravity = take(&work, n);
-  double clear, room;
+  double clear, room, gap;
   const orthocas_reference shifted = take_places(arm, &work);
   int good, cut, lost, known, status, limited = 1;
 
@@ -1321,7 +1321,9 @@ ORTHOCAS_API int orthocas_step(const orthocas_arm *arm, orthocas_state *state, i
   copy(speed, dq, n);
   if (arm->torque) observe(arm, state, here, speed, since);
   lost = state->bad_ticks >= safety->hold_ticks && state->bad_ticks > later(0, since); /* not after one slow tick */
-  known = !state->fresh && state->bad_ticks == 0 && !late && state->mode != ORTHOCAS_HOLD;
+  gap = since * (1.0 + (double)state->bad_ticks / (double)later(0, since)); /* with ticks that kept the command */
+  if (state->fresh || lost || late || state->mode == ORTHOCAS_HOLD) gap = 0.0;
+  known = gap > 0.0 && state->bad_ticks == 0;
   state->bad_ticks = 0;
   copy(state->q, here, n);
   copy(state->dq, speed, n);
@@ -1345,16 +1347,16 @@ ORTHOCAS_API int orthocas_step(const orthocas_arm *arm, orthocas_state *state, i
   fallback_at(arm, here, gains->used, fallback);
   /* Who commands, and the command. */
   choose_mode(arm, state, status, clear, room, error, since, late, work);
-  for (int i = 0; i < n; ++i) { /* a law that made joints fast gets no more than it had */
+  for (int i = 0; i < n; ++i) { /* one that made joints fast, or touches, gets no more than it had */
     const double had = state->command[i] - fallback[i];
     if (works(status)) state->law[i] = law[i] - fallback[i];
-    if (state->mode == ORTHOCAS_CATCHER && state->cause == ORTHOCAS_TOO_FAST)
+    if (state->mode == ORTHOCAS_CATCHER && (state->cause == ORTHOCAS_TOO_FAST || state->cause == ORTHOCAS_TOUCHED))
       state->law[i] = fmin(fmax(state->law[i], fmin(had, 0.0)), fmax(had, 0.0));
   }
   if (works(status) && state->mode == ORTHOCAS_LAW && room >= safety->return_margin + rules.room)
     copy(state->safe, here, n); /* the law works here */
   if (arm->torque)
-    compose_torque(arm, state, room, known ? since : 0.0, fallback, command, M, bias, gravity, work);
+    compose_torque(arm, state, room, gap, fallback, command, M, bias, gravity, work);
   else compose_velocity(arm, state, fallback, command);
   cut = cut_command(arm, state, since, command) || status == ORTHOCAS_SATURATED;
   copy(state->command, command, n);
@@ -1393,9 +1395,9 @@ static double share_inside(const orthocas_arm *arm, const orthocas_safety *safet
                            double *work) {
   const double clear = clearance(arm, q, work);
   const double margin = fmin(safety->return_margin, distance(arm, q, motion, 0.0, clear, work));
-  double inner = 0.0, outer = 1.0, tried = 1.0;
-  for (int k = 0; k <= rules.bisections && inner < outer; ++k, tried = 0.5 * (inner + outer))
-    *(distance(arm, q, motion, tried, clear, work) >= margin ? &inner : &outer) = tried;
+  double inner = 0.0, outer = 2.0; /* the whole motion first */
+  for (int k = 0; k <= rules.bisections && inner < 1.0; ++k)
+    *(distance(arm, q, motion, 0.5 * (inner + outer), clear, work) >= margin ? &inner : &outer) = 0.5 * (inner + outer);
   return inner;
 }
 
