@@ -23,7 +23,8 @@ CHARTS = (
 )
 PERIODS, RUNS = (1e-3, 2e-3), 2  # [s], of each case
 FAST = 1.5  # [limits of speed]
-REST, MOVES = 2.5, 0.5  # [s] until a catch is over, [rad/s] 1.5 s after a blow, or when brakes open
+MOVES = 0.5  # [rad/s] 1.5 s after a blow, or when brakes open
+SHAKES = 0.1  # before the end of the time that is watched: caught, without rest [s]
 DRY = 0.8  # Coulomb friction, of what may hold a joint
 COUNTED = "dead", "dead_and_led", "stated", "sticks", "led", "caught", "moved"
 HEADER = (
@@ -66,7 +67,7 @@ def count(arm: faults.Arm, each: int) -> list[int]:
                 crossed["sticks"].append(faults.stands_still(stiff, "reference")[1] > FAST)
                 crossed["led"] += [faults.led(seen, ask) > FAST for ask in faults.ASKED]
                 ends = [faults.caught(seen, delay) for delay in faults.DELAYS]
-                crossed["caught"] += [rest > REST or not back for rest, back in ends]
+                crossed["caught"] += [rest > faults.WATCHED - SHAKES or not back for rest, back in ends]
                 crossed["moved"] += [faults.blow(seen)[1] > MOVES, faults.brakes(seen) > MOVES]
     faults.TICK = PERIODS[0]
     return [sum(map(len, crossed.values())), *(int(np.sum(values)) for values in crossed.values())]

@@ -249,6 +249,7 @@ def moves(arm: Arm, scale: float = 1.0, delay: int = 0, push: float = 0.0) -> Mo
 
 
 DELAYS = 0, 1, 3, 5  # [ms]
+WATCHED, BACK = 2.5, 0.5  # of a caught arm, until it is asked back and then [s]
 STANDING = ("moving", "way back", "reference", "integral")
 
 
@@ -363,19 +364,20 @@ def led(arm: Arm, ask: Asking) -> float:
 
 
 def caught(arm: Arm, delay: int) -> tuple[float, bool]:
-    """The time until all joints rest [s], and whether the catcher then goes on when asked."""
+    """The time until all joints rest, at most `WATCHED` [s], and whether the catcher then goes on when asked."""
     robot, n = arm.robot, arm.chart.n
     q = arm.rng.uniform(np.maximum(robot.lower, -np.pi), np.minimum(robot.upper, np.pi))
     supervisor, plant = arm.started(q, return_margin=0.99, near_margin=0.98)  # as if nothing were inside
     plant.reset(q, arm.rng.uniform(-0.5, 0.5, n))
-    late, last, asked = deque([robot.gravity(q)] * delay), 0, arm.resting(arm.chart.problem.domain.centre)
-    for k in range(3000):
-        if k == 2500:
+    late = deque([robot.gravity(q)] * round(1e-3 * delay / TICK))
+    last, watched, asked = 0, round(WATCHED / TICK), arm.resting(arm.chart.problem.domain.centre)
+    for k in range(watched + round(BACK / TICK)):
+        if k == watched:
             supervisor.resume()
         command, status = supervisor.step(*arm.seen(plant), asked, TICK)
         late.append(command)
         plant.step(late.popleft(), TICK)
-        if k < 2500 and np.abs(plant.dq).max() > REST:
+        if k < watched and np.abs(plant.dq).max() > REST:
             last = k + 1
     return last * TICK, status is not ControlStatus.CAUGHT
 

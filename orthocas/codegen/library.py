@@ -343,11 +343,11 @@ def _build_state(
     counts = ("mode", "cause", "asked", "bad_ticks", "fresh", "stale_ticks", "same_ticks")
     names = ("q", "dq", "seen_q", "seen_dq", "command", "led", "impulse", "impulse_from", "law", "anchor", "safe")
     layout: dict[str, Any] = dict.fromkeys(counts, ctypes.c_int)
-    layout |= dict.fromkeys(("weight", "brake", "unseen", "hasty"), number)
+    layout |= dict.fromkeys(("weight", "brake", "unseen", "hasty", "energy"), number)
     layout |= dict.fromkeys(names, joints) | dict.fromkeys(("offset", "integral"), quantities)
     if has_spring:
         layout |= dict.fromkeys(("load", "drive", "speed"), joints) | {"inertia": number * n**2}
-        layout |= dict.fromkeys(("expected", "unexplained", "momentum", "trend"), joints)
+        layout |= dict.fromkeys(("expected", "unexplained", "momentum", "trend", "touch"), joints)
     # Laws that remember have their fields before the last reference.
     if memory._fields_:
         layout["memory"] = memory

@@ -45,6 +45,7 @@ class ControlStatus(IntEnum):
     HELD = 11  #: why the catcher took over: brakes held the arm
     STOPPED_EARLY = 12  #: of the inverse map in C: its iterations were not enough
     LOAD_MISMATCH = 13  #: of the check before a start: another torque holds the arm than the model's
+    TOUCHED = 14  #: why the catcher took over: the arm felt a contact, or got more energy than it may
 
     @property
     def words(self) -> str:

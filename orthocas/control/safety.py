@@ -19,11 +19,12 @@ from orthocas.tools.interrupts import deferred
 
 UNBOUNDED = (  #: settings that may be infinite
     *("command_rate", "speed_limit", "stuck_speed", "lower", "upper", "error_limit"),
-    *("reference_speed", "reference_acceleration", "start_mismatch", "friction"),
+    *("reference_speed", "reference_acceleration", "start_mismatch", "friction", "contact_torque", "energy_limit"),
 )
 SIGNED = ("lower", "upper")  #: settings that may be negative
 TORQUE_ONLY = (  #: not of velocity laws
     *("observer_rate", "encoder_step", "friction", "stop_zone", "stop_damping", "brake_stiffness", "brake_yield"),
+    *("contact_torque", "energy_limit", "energy_rate"),
 )
 
 
@@ -55,6 +56,7 @@ class SafetyRules:
     fine_step: float = 2 * np.pi / 2**13  #: of an encoder [rad]
     observer: float = 60.0  #: poles of the observer for that step, at most twice that for finer ones [1/s]
     turn_per_metre: float = 40 * np.pi  #: encoders of sliding joints turn once in 5 cm [rad/m]
+    power: float = 10.0  #: that commands may give the arm for good, to rub and to lift [W]
     error: float = 0.02  #: of models and torque sensors, as a share of the effort limit; without one, of gravity
 
 
@@ -111,6 +113,9 @@ class Safety:
     damping: Annotated[float, "rate of the catcher's damping -d M dq [1/s]; velocity laws: of the way to the anchor"]
     brake_stiffness: Annotated[float, "spring of the catcher, per inertia [1/s^2]"]
     brake_yield: Annotated[Array, "largest torque of that spring, which gives way slowly beyond it [N m]"]
+    contact_torque: Annotated[Array, "torque beside the load at which the catcher takes over: guarded moves [N m]"]
+    energy_limit: Annotated[float, "energy beyond energy_rate that commands may give the arm; then, the catcher [J]"]
+    energy_rate: Annotated[float, "power that commands may give the arm for good [W]"]
     start_mismatch: Annotated[Array, "torque by which what holds the arm may differ from the model at a start [N m]"]
 
     def __init__(self, **settings: Any) -> None:
@@ -126,8 +131,9 @@ class Safety:
             if get_args(setting.type)[0] is int:
                 require_count(setting.name, value, least=0)
             elif get_args(setting.type)[0] is float:
-                if not 0 < as_number(setting.name, value) < np.inf:
-                    raise InvalidValueError(setting.name, value, "a finite number > 0")
+                number, endless = as_number(setting.name, value), setting.name in UNBOUNDED
+                if not (0 < number < np.inf or (endless and number == np.inf)):
+                    raise InvalidValueError(setting.name, value, "a number > 0" if endless else "a finite number > 0")
             else:
                 # Lists are frozen; some may be infinite, some negative.
                 array = np.array(as_float_array(setting.name, value))
@@ -219,6 +225,9 @@ class Safety:
             "damping": RULES.catcher if torque else RULES.anchor,
             "brake_stiffness": RULES.catcher**2,
             "brake_yield": 0.5 * gravity + 10 * np.diag(M),
+            "contact_torque": np.full(n, np.inf),
+            "energy_limit": np.inf,
+            "energy_rate": RULES.power,
             "start_mismatch": RULES.friction + RULES.error * efforts,
         }
         unknown = sorted(set(changes) - set(settings))

@@ -1,5 +1,5 @@
 /* The runtime alone, under a made-up arm whose kernels do what a test asks them: NaN, singular matrices, overflow. It goes
- * through what no robot does every day, and counts branches (R1 to R31 of docs/reference/runtime.md).
+ * through what no robot does every day, and counts branches (R1 to R34 of docs/reference/runtime.md).
  *
  * Three joints with unit inertia; the third one turns without end. phi = (atan(q0), q1, q2), undefined where |q0| > 50;
  * the law is a spring and a damper. Exits with the number of failed checks, and prints their lines. */
@@ -252,7 +252,7 @@ static const orthocas_arm *arm;
 static orthocas_state state;
 static orthocas_safety safety;
 static orthocas_reference reference, given;
-static double numbers[48 * N + 2 * N * N], settings[20][N], values[6][K], work[WORK];
+static double numbers[48 * N + 2 * N * N], settings[21][N], values[6][K], work[WORK];
 static double q[N], dq[N], command[N], limit[N], used[2 * N];
 static const double anything[N] = {INFINITY, INFINITY, INFINITY};
 
@@ -263,15 +263,15 @@ static void set(double *x, double a, double b, double c) {
 }
 
 static void fill_settings(void) {
-  const double defaults[20] = {1e4, 6, 0.5, 0.15, 4, 20, -3, 3, 900, 0, 0.05, 60, 30, 0.6, 0.5, 0.0, 0.2, 2, 0, 0};
-  const double **places[20] = {&safety.command_rate, &safety.speed_limit, &safety.rest_speed, &safety.stuck_speed,
+  const double defaults[21] = {1e4, 6, 0.5, 0.15, 4, 20, -3, 3, 900, 0, 0.05, 60, 30, 0.6, 0.5, 0.0, 0.2, 2, 0, 0, INFINITY};
+  const double **places[21] = {&safety.command_rate, &safety.speed_limit, &safety.rest_speed, &safety.stuck_speed,
                                &safety.reference_speed, &safety.reference_acceleration, &safety.lower, &safety.upper,
                                &safety.stop_stiffness, &safety.observer_rate, &safety.stop_zone, &safety.stop_damping,
                                &safety.brake_yield, &safety.error_limit, &safety.offset_rate, &safety.integral_rate,
                                &safety.integral_limit, &safety.start_mismatch, &safety.friction,
-                               &safety.encoder_step};
+                               &safety.encoder_step, &safety.contact_torque};
   int i;
-  for (i = 0; i < 20; ++i) {
+  for (i = 0; i < 21; ++i) {
     set(settings[i], defaults[i], defaults[i], defaults[i]);
     *places[i] = settings[i];
   }
@@ -284,6 +284,8 @@ static void fill_settings(void) {
   safety.longest_period = 0.02;
   safety.damping = 12;
   safety.brake_stiffness = 144;
+  safety.energy_limit = INFINITY;
+  safety.energy_rate = 10;
   safety.hold_ticks = 3;
   safety.stale_ticks = 5;
 }
@@ -293,6 +295,7 @@ static void open_all(const orthocas_arm *which) {
                                         &state.impulse, &state.impulse_from, &state.law, &state.anchor, &state.safe,
                                         &state.limit, &state.offset, &state.integral, &state.load, &state.drive,
                                         &state.speed, &state.expected, &state.unexplained, &state.momentum, &state.trend,
+                                        &state.touch,
                                         &state.reference.value, &state.reference.velocity,
                                         &state.reference.acceleration};
   size_t i;
@@ -316,7 +319,7 @@ static void open_all(const orthocas_arm *which) {
 static void start_law(const orthocas_arm *which) {
   static const double still[N] = {0};
   open_all(which);
-  orthocas_take_over(arm, &state, q, still, work);
+  orthocas_begin(arm, &state, ORTHOCAS_LAW, q, still, work);
   orthocas_reference_at(arm, q, &reference, work);
 }
 
@@ -452,12 +455,13 @@ static void test_control(void) {
 
 static void test_settings(void) {
   double *scalars[] = {&safety.near_margin, &safety.catch_margin, &safety.return_margin, &safety.fade_in, &safety.fade_out,
-                       &safety.return_speed, &safety.longest_period, &safety.damping, &safety.brake_stiffness};
+                       &safety.return_speed, &safety.longest_period, &safety.damping, &safety.brake_stiffness,
+                       &safety.energy_rate, &safety.energy_limit};
   const double bad[] = {NAN, -1.0, 0.0, INFINITY};
   size_t i, b;
   start_law(arm);
-  for (i = 0; i < 20; ++i) {
-    const int any = i < 2 || (i > 2 && i < 8) || i == 13 || i == 17 || i == 18;
+  for (i = 0; i < 21; ++i) {
+    const int any = i < 2 || (i > 2 && i < 8) || i == 13 || i == 17 || i == 18 || i == 20;
     const int only_torque = (i > 8 && i < 13) || i > 17;
     fill_settings();
     CHECK(orthocas_check_settings(arm, &safety));
@@ -472,7 +476,7 @@ static void test_settings(void) {
     for (b = 0; b < 4; ++b) {
       fill_settings();
       *scalars[i] = bad[b];
-      CHECK(orthocas_check_settings(arm, &safety) == (i == 8 && !arm->torque));
+      CHECK(orthocas_check_settings(arm, &safety) == ((i > 7 && !arm->torque) || (i == 10 && b == 3)));
     }
   fill_settings();
   safety.hold_ticks = -1;
@@ -615,20 +619,20 @@ static void test_modes(void) {
   double held[N] = {1, 1, 1};
   int k;
   open_all(arm); /* well inside, the law takes over by itself */
-  orthocas_start(arm, &state, q, 0, work);
+  orthocas_begin(arm, &state, ORTHOCAS_CATCHER, q, 0, work);
   orthocas_reference_at(arm, q, &reference, work);
   CHECK(step(1e-3) == ORTHOCAS_OK);
   CHECK(steps(40) == ORTHOCAS_OK);
   CHECK(state.weight >= 1.0);
   open_all(arm); /* with a command; at a position that is none; with a command that is none */
-  orthocas_start(arm, &state, q, held, work);
+  orthocas_begin(arm, &state, ORTHOCAS_CATCHER, q, held, work);
   CHECK(fabs(state.command[0] - 1.0) < 1e-12);
   held[1] = NAN;
-  orthocas_start(arm, &state, held, held, work);
+  orthocas_begin(arm, &state, ORTHOCAS_CATCHER, held, held, work);
   CHECK(step(1e-3) == ORTHOCAS_CAUGHT || step(1e-3) == ORTHOCAS_OK);
   open_all(arm); /* outside, the catcher holds the arm; the way back */
   set(q, 1.49, 0, 0);
-  orthocas_start(arm, &state, q, 0, work);
+  orthocas_begin(arm, &state, ORTHOCAS_CATCHER, q, 0, work);
   orthocas_reference_at(arm, q, &reference, work);
   CHECK(steps(3) == ORTHOCAS_CAUGHT);
   orthocas_resume(&state);
@@ -647,7 +651,7 @@ static void test_modes(void) {
   /* On the way, it does not work, so the anchor goes on to the centre; then a joint is too fast. */
   open_all(arm);
   set(q, 1.49, 0, 0);
-  orthocas_start(arm, &state, q, 0, work);
+  orthocas_begin(arm, &state, ORTHOCAS_CATCHER, q, 0, work);
   (void)steps(2);
   orthocas_resume(&state);
   fault.status = ORTHOCAS_SINGULAR;
@@ -698,11 +702,11 @@ static void test_modes(void) {
   CHECK(steps(2) != ORTHOCAS_BAD_INPUT);
   open_all(arm); /* near the boundary; beyond it */
   set(q, 1.43, 0, 0);
-  orthocas_take_over(arm, &state, q, dq, work);
+  orthocas_begin(arm, &state, ORTHOCAS_LAW, q, dq, work);
   orthocas_reference_at(arm, q, &reference, work);
   CHECK(steps(2) == ORTHOCAS_NEAR_BOUNDARY || arm->boundary.lines > 0);
   q[0] = -1.49;
-  orthocas_take_over(arm, &state, q, dq, work);
+  orthocas_begin(arm, &state, ORTHOCAS_LAW, q, dq, work);
   CHECK(step(1e-3) == ORTHOCAS_CAUGHT);
   CHECK(state.cause == ORTHOCAS_OUTSIDE_DOMAIN);
   /* The spring gives way, stops push back, loads are learned, and a fast arm is slowed down. */
@@ -749,7 +753,7 @@ static void test_reference(void) {
   }
   open_all(arm); /* begins where nothing is measured */
   fault.deviation = NAN;
-  orthocas_take_over(arm, &state, q, dq, work);
+  orthocas_begin(arm, &state, ORTHOCAS_LAW, q, dq, work);
   orthocas_reference_at(arm, q, &reference, work);
   CHECK(is_finite(arm, &state.reference) && is_finite(arm, &reference));
   q[0] = NAN;
@@ -757,7 +761,7 @@ static void test_reference(void) {
   CHECK(is_finite(arm, &reference));
   /* The catcher releases the arm where errors are no numbers. */
   open_all(arm);
-  orthocas_start(arm, &state, q, 0, work);
+  orthocas_begin(arm, &state, ORTHOCAS_CATCHER, q, 0, work);
   fault.deviation = NAN;
   (void)steps(2);
   CHECK(all_finite(arm, state.offset, K));
@@ -800,7 +804,7 @@ static void test_reference(void) {
   for (k = 0; k < 4; ++k) {
     open_all(arm);
     set(q, 1.4, 0, 0);
-    orthocas_take_over(arm, &state, q, dq, work);
+    orthocas_begin(arm, &state, ORTHOCAS_LAW, q, dq, work);
     orthocas_reference_at(arm, q, &reference, work);
     state.fresh = 0;
     fault.singular = k == 2;
@@ -863,15 +867,15 @@ static void test_observer(void) {
 static void test_memory(void) {
   double held[N] = {1, 2, 3}, none[N] = {NAN, 0, 0};
   open_all(arm);
-  orthocas_start(arm, &state, q, held, work);
+  orthocas_begin(arm, &state, ORTHOCAS_CATCHER, q, held, work);
   CHECK(state.fresh == 2);
   (void)step(1e-3);
   CHECK(state.fresh == 0 && fabs(state.memory[N] - (1.0 - 0.01)) < 0.1);
-  orthocas_start(arm, &state, q, none, work);
+  orthocas_begin(arm, &state, ORTHOCAS_CATCHER, q, none, work);
   CHECK(state.fresh == 1);
-  orthocas_start(arm, &state, q, 0, work);
+  orthocas_begin(arm, &state, ORTHOCAS_CATCHER, q, 0, work);
   CHECK(state.fresh == 1);
-  orthocas_start(arm, &state, none, held, work); /* no measurement at the start: learned from the fallback there */
+  orthocas_begin(arm, &state, ORTHOCAS_CATCHER, none, held, work); /* no measurement at the start: learned from the fallback there */
   set(q, NAN, 0, 0);
   CHECK(steps(5) == ORTHOCAS_BAD_INPUT);
   CHECK(state.fresh == 1);
@@ -988,6 +992,57 @@ static void test_contacts(void) {
   good();
 }
 
+/* ---- R33, R34: guarded moves, and the energy that commands give ---- */
+
+static void test_guarded(void) {
+  double felt = 0.0, load = 0.0, given = 0.0;
+  int k;
+  start_law(arm); /* something holds the arm against 4 N m: its torque is felt at 60 1/s, and its load learned at 2 1/s */
+  (void)steps(2);
+  set(settings[20], 3.0, 3.0, 3.0);
+  fault.law = 4.0;
+  (void)step(1e-3);
+  for (k = 0; k < 200 && state.mode == ORTHOCAS_LAW; ++k) {
+    (void)step(1e-3);
+    felt += 0.06 * (-4.0 - felt);
+    load += 0.002 * (4.0 - load);
+    CHECK(fabs(state.touch[1] - felt) < 1e-9 && fabs(state.load[1] - load) < 1e-9);
+    CHECK(state.mode == ORTHOCAS_CATCHER || -felt - load < 3.0 + 0.06);
+  }
+  CHECK(state.cause == ORTHOCAS_TOUCHED && -felt - load > 3.0 - 0.06);
+  orthocas_resume(&state); /* not while it is felt; then it is a load */
+  CHECK(steps(2) == ORTHOCAS_CAUGHT);
+  CHECK(state.asked && state.mode == ORTHOCAS_CATCHER);
+  fault.law = 0.0;
+  (void)steps(300);
+  CHECK(state.mode == ORTHOCAS_LAW);
+  open_all(arm); /* nor on the way back */
+  set(q, 1.49, 0, 0);
+  orthocas_begin(arm, &state, ORTHOCAS_CATCHER, q, 0, work);
+  (void)steps(2);
+  orthocas_resume(&state);
+  CHECK(steps(2) == ORTHOCAS_RETURNING);
+  settings[20][0] = 1e-6;
+  CHECK(steps(5) == ORTHOCAS_CAUGHT && state.cause == ORTHOCAS_TOUCHED);
+  start_law(arm); /* a joint moves on while the law drives it: energy is torque times way, less what is allowed */
+  safety.energy_limit = 0.05;
+  safety.energy_rate = 0.5;
+  fault.law = 6.0;
+  set(dq, 0, 0.5, 0);
+  (void)steps(2);
+  given = state.energy;
+  for (k = 0; k < 200 && state.mode == ORTHOCAS_LAW; ++k) {
+    const double drive = command[1] - 0.1 * state.q[1] - 0.01 * 0.5;
+    q[1] += 0.5e-3;
+    (void)step(1e-3);
+    given += (drive * 0.5 - 0.5) * 1e-3;
+    CHECK(fabs(state.energy - given) < 1e-9 && (state.mode == ORTHOCAS_CATCHER || given < 0.05 + 2e-3));
+  }
+  CHECK(state.cause == ORTHOCAS_TOUCHED && given > 0.05);
+  (void)steps(200); /* the catcher takes it back, and so does time */
+  CHECK(!(state.energy > 0.0));
+}
+
 /* Measurements end while the arm moves: its command brakes it as foreseen, and goes on to what holds it. */
 static void test_blind(void) {
   double least = 0.0;
@@ -1021,6 +1076,7 @@ int main(void) {
     test_reference();
     test_observer();
     test_blind();
+    test_guarded();
     test_programs();
     open_all(arms + k);
     test_boundary();

@@ -45,7 +45,7 @@ def test_every_library_has_the_same_text(pd_plus: tuple[GeneratedC, PDPlus], tmp
 
 def test_it_is_short_and_has_no_state() -> None:
     text = re.sub(r"/\*.*?\*/", "", SOURCE.read_text(), flags=re.DOTALL)
-    assert len(SOURCE.read_text().splitlines()) <= 1570
+    assert len(SOURCE.read_text().splitlines()) <= 1500
     assert not re.findall(r"^static (?!const)[^(=]*[;=]", text, flags=re.MULTILINE)
     assert not re.findall(r"\b(?:malloc|calloc|realloc|free|printf|goto|setjmp)\b", text)
 

@@ -29,11 +29,12 @@ enum {
   ORTHOCAS_LATE = 10,
   ORTHOCAS_HELD = 11,
   ORTHOCAS_STOPPED_EARLY = 12,
-  ORTHOCAS_LOAD_MISMATCH = 13
+  ORTHOCAS_LOAD_MISMATCH = 13,
+  ORTHOCAS_TOUCHED = 14
 };
 enum { ORTHOCAS_LAW = 0, ORTHOCAS_CATCHER = 1, ORTHOCAS_RETURN = 2, ORTHOCAS_HOLD = 3 };
 
-/* Values of the controlled quantities with two derivatives: places of k numbers each. */
+/* Values of the controlled quantities with two derivatives: places of k numbers each, one after the other. */
 typedef struct {
   double *value, *velocity, *acceleration;
 } orthocas_reference;
@@ -144,12 +145,12 @@ typedef struct {
 typedef struct {
   const double *command_rate, *speed_limit, *rest_speed, *stuck_speed;            /* (n,) */
   const double *reference_speed, *reference_acceleration, *start_mismatch;        /* (n,) */
-  const double *friction, *encoder_step;                                          /* (n,), null for velocity laws */
+  const double *friction, *encoder_step, *contact_torque;                         /* (n,), null for velocity laws */
   const double *lower, *upper, *stop_stiffness;                                   /* (n,) */
   const double *observer_rate, *stop_zone, *stop_damping, *brake_yield;           /* (n,), null for velocity laws */
   const double *error_limit, *offset_rate, *integral_rate, *integral_limit;       /* (k,) */
   double near_margin, catch_margin, return_margin, fade_in, fade_out, return_speed, longest_period, damping;
-  double brake_stiffness; /* torque laws */
+  double brake_stiffness, energy_limit, energy_rate; /* torque laws */
   int hold_ticks, stale_ticks;
 } orthocas_safety;
 
@@ -157,10 +158,10 @@ typedef struct {
 typedef struct {
   int mode, cause;
   int asked, bad_ticks, fresh, stale_ticks, same_ticks;
-  double weight, brake, unseen, hasty;
+  double weight, brake, unseen, hasty, energy;
   double *q, *dq, *seen_q, *seen_dq, *command, *led, *impulse, *impulse_from, *law, *anchor, *safe, *limit; /* (n,) */
   double *offset, *integral;                                                                                /* (k,) */
-  double *load, *drive, *speed, *expected, *unexplained, *momentum, *trend;  /* (n,), null for velocity laws */
+  double *load, *drive, *speed, *expected, *unexplained, *momentum, *trend, *touch; /* (n,), null for velocity laws */
   double *inertia;                                                           /* (n, n), null for velocity laws */
   double *memory;                                                            /* (memory,) or null */
   orthocas_reference reference;
@@ -179,7 +180,7 @@ typedef struct {
 /* Numbers and integers of `work` that functions need at most. */
 #define ORTHOCAS_INVERSE_WORK(n) ((n) * ((n) + 7))
 #define ORTHOCAS_NEAREST_WORK(n, rooms)                                                                               \
-  (4 * (n) * (n) + 14 * (n) + 4 * (rooms) + 3 * (n) * (rooms) + (2 * (n) + (rooms)) * (2 * (n) + (rooms) + 1))
+  (5 * (n) * (n) + 14 * (n) + 4 * (rooms) + 3 * (n) * (rooms) + (2 * (n) + (rooms)) * (2 * (n) + (rooms) + 1))
 #define ORTHOCAS_NEAREST_HELD(n, rooms) ((n) + (rooms))
 #define ORTHOCAS_LAW_WORK(n, k, shared, memory) (3 * (n) * (n) + 10 * (n) + 9 * (k) + (shared) + (memory))
 
@@ -207,10 +208,8 @@ ORTHOCAS_API int orthocas_control(const orthocas_arm *arm, const double *q, cons
 ORTHOCAS_API int orthocas_check_settings(const orthocas_arm *arm, const orthocas_safety *safety);
 ORTHOCAS_API int orthocas_check_start(const orthocas_arm *arm, const orthocas_safety *safety, const double *q,
                                       const double *torque, const void *gains, double *mismatch, double *work);
-ORTHOCAS_API void orthocas_start(const orthocas_arm *arm, orthocas_state *state, const double *q, const double *command,
-                                 double *work);
-ORTHOCAS_API void orthocas_take_over(const orthocas_arm *arm, orthocas_state *state, const double *q,
-                                     const double *command, double *work);
+ORTHOCAS_API void orthocas_begin(const orthocas_arm *arm, orthocas_state *state, int mode, const double *q,
+                                 const double *command, double *work);
 ORTHOCAS_API void orthocas_resume(orthocas_state *state);
 ORTHOCAS_API void orthocas_stand(const orthocas_arm *arm, orthocas_state *state, int mode, const double *q,
                                  const double *command);
