@@ -4,8 +4,10 @@ import time
 from importlib.metadata import files
 from pathlib import Path
 
+import casadi as ca
 import numpy as np
 from benchmark import run, table
+from c_timing import nanoseconds_per_call
 from numpy.typing import NDArray
 
 import orthocas as oc
@@ -41,7 +43,7 @@ WHOLE = (("iiwa", "pose"), ("panda", "pose"), ("xarm7", "pose"), ("iiwa", "posit
 NEARER = 0.05  # clearance
 HEADER = (
     "| arm, task | branch, its share | fit [s CPU] | regular share | leak rms [deg] | conditioning mean, 1 % "
-    "| targets found |\n|" + " --- |" * 7
+    "| targets found | C of phi, J [us] |\n|" + " --- |" * 8
 )
 CLEARER = "| arm, pose | branch | regular share | conditioning mean, 1 % |\n|" + " --- |" * 4
 TARGETS = "| arm, task | branches | targets | found, of all clear ones |\n|" + " --- |" * 4
@@ -80,8 +82,15 @@ def row(name: str, task: str, metric: str, quick: bool, charts: dict[str, oc.Cha
     return (
         f"| {words} | {branch.name}, {share} | {seconds:.1f} | {regular} "
         f"| {report.leak.rms:.1f} | {report.conditioning.mean:.2f}, {report.conditioning.p01:.2f} "
-        f"| {percent(chart.solve(targets).found.mean(), 2)} |"
+        f"| {percent(chart.solve(targets).found.mean(), 2)} | {time_in_c(chart, quick):.2f} |"
     )
+
+
+def time_in_c(chart: oc.Chart, quick: bool) -> float:
+    """Time of phi and J in C by gcc -O3, with products in loops as in generated files [us]."""
+    q = ca.MX.sym("q", chart.n)
+    both = ca.Function("chart", [q], [chart.function("phi")(q), chart.function("jacobian")(q)])
+    return nanoseconds_per_call({"chart": both}, rounds=3 if quick else 15, calls=2000)["chart"] / 1e3
 
 
 def nearer(name: str, quick: bool) -> str:
