@@ -159,7 +159,7 @@ def main(quick: bool = False) -> dict[str, float]:
         warnings.simplefilter("ignore")
         head = "lines | possible by the search | of these by `follow` | share [%]"
         print(f"| {head} |")
-        table("| --- " * (head.count("|") + 1) + "|", follow_lines(2 if quick else 20, found))
+        table("| --- " * (head.count("|") + 1) + "|", follow_lines(2 if quick else 50, found))
     return found
 
 
