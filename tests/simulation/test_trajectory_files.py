@@ -91,7 +91,7 @@ def resealed(run: Trajectory, path: Path, header: dict[str, Any], **arrays: Any)
         ({"version": 2}, {}, "has version 2, this orthocas reads 1"),
         ({}, {"dq": np.zeros((2, 2))}, r"dq has shape \(2, 2\)"),
         ({}, {"storage": np.zeros(0)}, r"storage has shape \(0,\)"),
-        ({}, {"status": np.full(51, 99)}, "status is 99, expected whole numbers from 0 to 13"),
+        ({}, {"status": np.full(51, 99)}, "status is 99, expected whole numbers from 0 to 14"),
         ({}, {"times": np.zeros(51)}, "times is empty or not increasing"),
         ({}, {"q": np.zeros((51, 3), dtype=complex)}, "contains an array or a header that cannot be read: no array"),
     ],
