@@ -100,7 +100,8 @@ def require_same(found: tuple[Any, Any], chart: oc.Chart, phi: Array, starts: Ar
     want = np.where(np.isin(known.status, (InverseStatus.SINGULAR, InverseStatus.OUT_OF_REACH)), 5, known.status)
     other = status != want
     assert other.mean() < 0.02
-    assert (want[other] == FOUND).all()
+    # of rows that neither finds, the reason may differ: how Newton's method ends
+    assert ((want[other] == FOUND) | (status[other] != FOUND)).all()
     solved = ~other & (want != NOT_FOUND)
     np.testing.assert_allclose(q[solved], known.q[solved], rtol=0, atol=1e-9)
 
