@@ -100,8 +100,10 @@ def require_same(found: tuple[Any, Any], chart: oc.Chart, phi: Array, starts: Ar
     want = np.where(np.isin(known.status, (InverseStatus.SINGULAR, InverseStatus.OUT_OF_REACH)), 5, known.status)
     other = status != want
     assert other.mean() < 0.02
-    # of rows that neither finds, the reason may differ: how Newton's method ends
-    assert ((want[other] == FOUND) | (status[other] != FOUND)).all()
+    # where only the export finds one, in an odd row, it has to be right
+    odd = other & (want != FOUND) & (status == FOUND)
+    assert np.abs(chart.parts.phi_map.residual(phi[odd], q[odd])).max(initial=0.0) < 1e-8
+    assert chart.domain.contains(q[odd]).all()
     solved = ~other & (want != NOT_FOUND)
     np.testing.assert_allclose(q[solved], known.q[solved], rtol=0, atol=1e-9)
 
