@@ -158,7 +158,7 @@ class MLP:
             cyclic joints of the problem; see `Polynomial`.
         without: names of joints that coordinates do not depend on; see `Polynomial`.
         activation: a, "tanh" as in the paper, or "isru", a(z) = z / sqrt(1 + z^2), the inverse square root unit
-            (Carlile et al., arXiv:1710.09967). It fits wide charts as well, and takes less time in C: a root and a quotient.
+            (Carlile et al., arXiv:1710.09967). It fits wide charts as well, and takes less time in C.
 
     Example:
         >>> import orthocas as oc

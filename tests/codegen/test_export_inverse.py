@@ -110,7 +110,9 @@ def require_same(found: tuple[Any, Any], chart: oc.Chart, phi: Array, starts: Ar
 def test_inverse_has_the_answers_of_the_chart(tmp_path: Path, name: str) -> None:
     chart = CHARTS[name]()
     module = module_of(chart, "numpy", tmp_path)
-    away = 0.01 if name in ("circle", "wide", "pose, wide") else 0.05  # beyond their domains, they fold: there are several solutions
+    away = (
+        0.01 if name in ("circle", "wide", "pose, wide") else 0.05
+    )  # beyond their domains, they fold: there are several solutions
     phi, starts = targets_of(chart, away=away)
     require_same(module.inverse(phi, starts), chart, phi, starts)
     q, status = module.inverse(phi[0], starts[0])

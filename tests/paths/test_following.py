@@ -1,6 +1,7 @@
 """Motions along tool paths: exact, within all limits, closed, and away from what the objective names."""
 
 import csv
+from dataclasses import replace
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -19,6 +20,7 @@ from orthocas.errors import InvalidValueError, NoExpressionError, PathError, Pat
 from orthocas.paths import JointMotion
 from orthocas.paths.follow import Costs, MotionLimits, XiChoice, walk
 from orthocas.paths.joint_curve import JointCurve, PhiSolver
+from orthocas.paths.tool_path import RULES as PATH_RULES
 from orthocas.paths.tool_path import ToolPath
 from orthocas.paths.xi_search import XiSearch
 from orthocas.robots.collisions import Collisions
@@ -313,6 +315,19 @@ def test_a_search_finds_a_clear_way_or_none(closed: bool) -> None:
     # A ball that no posture gets around.
     everywhere = put_ball(chart.robot, [0.0, 0.0, 0.0], 1.5, 0.02)
     assert XiSearch(solver, path, everywhere, 0.01, cost).find() is None
+
+
+def test_a_search_thins_the_postures_of_a_station(monkeypatch: pytest.MonkeyPatch) -> None:
+    chart = planar()
+    path = ToolPath.hold(chart, loop(chart, 0.1), chart.xi(START))
+    far = put_ball(chart.robot, [5.0, 5.0, 0.0], 0.05, 0.02)
+    search, x = XiSearch(PhiSolver(chart), path, far, 0.01, Costs(_limits(chart)).sum_squares), path.x(0.0)
+    every = search._list_postures(x)
+    monkeypatch.setattr("orthocas.paths.xi_search.RULES", replace(PATH_RULES, station_postures=5))
+    few = search._list_postures(x)
+    assert len(every) > len(few) == 5
+    assert {tuple(q) for q in few} <= {tuple(q) for q in every}
+    np.testing.assert_allclose(chart.x(every), np.tile(x, (len(every), 1)), atol=1e-6)
 
 
 @pytest.mark.slow

@@ -801,7 +801,7 @@ static int stops_clear(const orthocas_arm *arm, const orthocas_state *state, dou
 }
 
 /* R33: whether a joint feels more than contact_torque beside its load. R34: or commands gave the arm more energy than
- * energy_limit and energy_rate allow: that bounds what it gives to all it touches, wherever its reference moves. */
+ * energy_limit and energy_rate allow: it can give no more than that to what it touches, and what a fading law adds. */
 static int touches(const orthocas_arm *arm, const orthocas_state *state) {
   int touch = arm->torque && state->energy > state->safety->energy_limit;
   for (int i = 0; i < arm->n && arm->torque; ++i)
