@@ -80,7 +80,8 @@ class XiSearch:
         # joints that turn without end count once, and memory grows with the square of the number, or its cube
         q = q[(np.abs(q - home)[:, self._endless] <= np.pi).all(axis=1)]
         q = q[self._check_clear(q)]
-        return q[np.linspace(0, len(q) - 1, min(len(q), RULES.station_postures)).astype(int)]
+        kept: Array = q[np.linspace(0, len(q) - 1, min(len(q), RULES.station_postures)).astype(int)]
+        return kept
 
     def _check_clear(self, q: Array) -> Flags:
         return np.asarray(self.collisions.distance(q).distance > self.clearance, dtype=bool)
