@@ -26,8 +26,7 @@ from orthocas.paths.follow import HOLD, OBJECTIVE
 from orthocas.paths.follow import follow as follow_path
 from orthocas.paths.joint_motion import JointMotion, require_place
 from orthocas.paths.tool_path import read_path
-from orthocas.robots.obstacles import Capsule, Plane, Sphere
-from orthocas.robots.scene import Scene, Solid
+from orthocas.robots.obstacles import Capsule, Plane, Scene, Solid, Sphere
 from orthocas.tools.checks import Array, require_known
 from orthocas.tools.interrupts import deferred
 

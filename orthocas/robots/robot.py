@@ -16,8 +16,7 @@ from numpy.typing import ArrayLike
 from orthocas.errors import InvalidValueError, RobotError, ShapeError
 from orthocas.robots import dynamics, kinematics
 from orthocas.robots.capsules import build_rods
-from orthocas.robots.collision_data import KnownSolids
-from orthocas.robots.collision_files import CollisionSource
+from orthocas.robots.collision_files import CollisionSource, KnownSolids
 from orthocas.robots.collisions import Collisions
 from orthocas.robots.dynamics import PAYLOAD, add_payload
 from orthocas.robots.kinematics import add_tool

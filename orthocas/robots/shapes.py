@@ -1,6 +1,7 @@
 """Solids in the frame of a body or of the world: boxes, cylinders, rounded hulls, half-spaces and point clouds."""
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Protocol, Self
 
 import coal
@@ -8,7 +9,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from orthocas.tools.checks import Array, Flags
+from orthocas.tools.checks import Array, Flags, Indices
 
 
 @dataclass(frozen=True, slots=True)
@@ -323,3 +324,21 @@ class Shape:
                 best = volume, middle + low * axis, middle + high * axis, reach
         assert best is not None
         return best[1], best[2], best[3] * (1 + 1e-12)
+
+
+def read_mesh(file: Path, scale: Array) -> tuple[Array, Indices]:
+    """Vertices (V, 3) [m] and triangles (F, 3) of a mesh file, scaled.
+
+    Raises:
+        ValueError: if it cannot be read, has no triangle, or a vertex is not finite.
+    """
+    try:
+        mesh: Any = coal.MeshLoader().load(str(file), scale)
+    except RuntimeError as error:
+        raise ValueError(str(error)) from None
+    # coal's arrays belong to the mesh, and end with it.
+    vertices = np.array(mesh.vertices(), dtype=float).reshape(-1, 3)
+    faces = np.array([[t[0], t[1], t[2]] for t in map(mesh.tri_indices, range(mesh.num_tris))], dtype=np.intp)
+    if not (len(faces) and np.isfinite(vertices).all()):
+        raise ValueError("empty")
+    return vertices, faces

@@ -12,8 +12,8 @@ import numpy as np
 import scipy
 
 from orthocas.errors import RobotError
+from orthocas.robots.collision_files import load_mesh, place_links, read_numbers, read_pose
 from orthocas.robots.kinematics import build_body_poses, build_tip_pose
-from orthocas.robots.link_shapes import load_mesh, place_links, read_numbers, read_pose
 from orthocas.robots.robot import Robot
 from orthocas.robots.spatial import rotate_z_to
 from orthocas.robots.tree import KinematicTree
