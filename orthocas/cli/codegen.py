@@ -12,7 +12,6 @@ from orthocas.charts.ready import load
 from orthocas.cli.options import (
     AsJson,
     ChartPath,
-    DisabledPairs,
     Force,
     Limit,
     Solids,
@@ -41,7 +40,7 @@ def add_law_options(for_codegen: bool) -> Callable[[Callable[..., None]], Callab
     The command gets those that were given, by name, as texts.
     """
     options = {
-        name: Annotated[str | None, typer.Option(_name_option(name, setting), help=_describe_option(name, setting))]
+        name: (_build_option(name, setting), None)
         for law in map(law_of, law_names())
         for name, setting in law.options.items()
         if for_codegen or not setting.codegen_only
@@ -55,9 +54,10 @@ def _name_option(name: str, setting: Setting) -> str:
     return setting.option or f"--{name.replace('_', '-')}"
 
 
-def _describe_option(name: str, setting: Setting) -> str:
+def _build_option(name: str, setting: Setting) -> Any:
     takers = _find_laws_with(name)
-    return setting.help + ("" if len(takers) == len(law_names()) else f" For {', '.join(takers)}.")
+    text = setting.help + ("" if len(takers) == len(law_names()) else f" For {', '.join(takers)}.")
+    return Annotated[str | None, typer.Option(_name_option(name, setting), help=text)]
 
 
 def _find_laws_with(setting: str) -> list[str]:
@@ -82,7 +82,6 @@ def codegen(
         bool, typer.Option("--float", help="Numbers are float instead of double, for processors in single precision.")
     ] = False,
     collisions: Solids = None,
-    srdf: DisabledPairs = None,
     force: Force = False,
     json: AsJson = False,
 ) -> None:
@@ -103,7 +102,7 @@ def codegen(
         # Raises for grown charts.
         loaded.function("xi")
         law = None if controller == _NONE else build_controller(controller, loaded, settings, limit)
-        solids = read_solids(loaded.problem.robot, collisions, srdf)
+        solids = read_solids(loaded.problem.robot, collisions)
         capsules = None if solids is None else fit_capsules(solids)
         generated = generate_c(loaded, out, law, name, force, single_precision=single_precision, capsules=capsules)
         remarks = [] if law is None else [*law.remarks()]

@@ -12,10 +12,9 @@ from orthocas.charts.ready import load
 from orthocas.cli.options import (
     AsJson,
     ChartPath,
-    DisabledPairs,
     Force,
+    Number,
     Solids,
-    parse_number,
     parse_numbers,
     parse_one_or_all,
     read_solids,
@@ -45,16 +44,10 @@ def follow(
     start: Annotated[
         str | None, typer.Option("--start", help='Joint positions near the start, "0,0.5,..."; default: the centre.')
     ] = None,
-    period: Annotated[
-        float, typer.Option("--period", parser=parse_number, help="Distance of the time stamps [s].")
-    ] = 0.01,
+    period: Annotated[float, Number("--period", help="Distance of the time stamps [s].")] = 0.01,
     velocity: Annotated[
         str | None,
         typer.Option("--velocity-limit", help="Of all joints or each [rad/s], [m/s]; default: the robot's."),
-    ] = None,
-    acceleration: Annotated[
-        str | None,
-        typer.Option("--acceleration-limit", help="Of all joints or each [rad/s^2]; default: full speed in 0.5 s."),
     ] = None,
     obstacle: Annotated[
         list[str] | None,
@@ -64,19 +57,12 @@ def follow(
         ),
     ] = None,
     link_radius: Annotated[
-        float | None,
-        typer.Option(
-            "--link-radius", parser=parse_number, help="Take rods of this radius for links, without --collisions [m]."
-        ),
+        float | None, Number("--link-radius", help="Take rods of this radius for links, without --collisions [m].")
     ] = None,
     clearance: Annotated[
-        float,
-        typer.Option(
-            "--clearance", parser=parse_number, help="Smallest distance of links, and of links and obstacles [m]."
-        ),
+        float, Number("--clearance", help="Smallest distance of links, and of links and obstacles [m].")
     ] = 0.0,
     collisions: Solids = None,
-    srdf: DisabledPairs = None,
     force: Force = False,
     json: AsJson = False,
 ) -> None:
@@ -89,7 +75,7 @@ def follow(
         loaded.function("xi")
     # What is to be followed, and what the arm may hit: its links, or rods in their place, and obstacles.
     waypoints, choice = _read_task(path, loaded, xi)
-    solids = read_solids(loaded.problem.robot, collisions, srdf)
+    solids = read_solids(loaded.problem.robot, collisions)
     if link_radius is not None and (solids is not None or not obstacle):
         raise OptionError("--link-radius requires --obstacle, and no --collisions, which has the true links")
     if obstacle:
@@ -109,7 +95,6 @@ def follow(
         q_start=None if start is None else parse_numbers("--start", start),
         period=period,
         velocity_limits=None if velocity is None else parse_one_or_all("--velocity-limit", velocity),
-        acceleration_limits=None if acceleration is None else parse_one_or_all("--acceleration-limit", acceleration),
         clearance=clearance,
         collisions=solids,
     )

@@ -11,13 +11,12 @@ from orthocas import problems
 from orthocas.bases.cyclic import cyclic_joints
 from orthocas.cli.options import (
     AsJson,
-    DisabledPairs,
     ProblemName,
     ProblemOptions,
     Solids,
-    add_problem_options,
     is_robot_file,
     read_solids,
+    spread,
 )
 from orthocas.cli.output import build_reach_data, print_json, print_rows, print_table
 from orthocas.errors import OptionError, RobotError, SingularTaskError
@@ -40,7 +39,7 @@ _FAULTS = ("near_singular_share", "half_turn_share", "touching_share")
 _SHARES = ("share", "clear_share", "share of the branch", "branches", *_FAULTS)  #: names of numbers to show in percent
 
 
-@add_problem_options("tip", "lock", "tool", "base")
+@spread("words", ProblemOptions, "tip", "lock", "base")
 def info(
     target: ProblemName,
     words: ProblemOptions,
@@ -48,7 +47,6 @@ def info(
         bool, typer.Option("--branches", help="Of a robot: also the branches of its joint range, for wide charts.")
     ] = False,
     collisions: Solids = None,
-    srdf: DisabledPairs = None,
     json: AsJson = False,
 ) -> None:
     """Show a chart, a named problem, or a robot."""
@@ -59,14 +57,14 @@ def info(
             **_describe_robot(robot),
             **_describe_redundancy(robot),
             **(_describe_branches(robot, None) if branches else {}),
-            **_describe_collisions(read_solids(robot, collisions, srdf), robot.sample),
+            **_describe_collisions(read_solids(robot, collisions), robot.sample),
         }
     elif target in problems.names():
         problem = words.build_problem(target)
         data = {
             **_describe_problem(problem),
             **(_describe_branches(problem.robot, problem.task) if branches else {}),
-            **_describe_collisions(read_solids(problem.robot, collisions, srdf), problem.domain.sample),
+            **_describe_collisions(read_solids(problem.robot, collisions), problem.domain.sample),
         }
     elif branches:
         raise OptionError(f"--branches requires a robot file or a named problem, not the chart {target}")
@@ -78,7 +76,7 @@ def info(
             "parametrisation": chart.coordinates.label,
             "parameters": chart.coordinates.size,
             **build_reach_data(chart),
-            **_describe_collisions(read_solids(chart.problem.robot, collisions, srdf), chart.problem.domain.sample),
+            **_describe_collisions(read_solids(chart.problem.robot, collisions), chart.problem.domain.sample),
             "notes": dict(chart.notes),
             **({"certificate": chart.certificate.as_dict()} if chart.certificate else {}),
         }

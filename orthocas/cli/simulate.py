@@ -16,13 +16,11 @@ from orthocas.cli.codegen import CONTROLLERS, add_law_options, build_controller,
 from orthocas.cli.options import (
     AsJson,
     ChartPath,
-    DisabledPairs,
     Force,
     Limit,
+    Number,
     Solids,
-    parse_number,
     parse_numbers,
-    parse_whole_number,
     read_solids,
 )
 from orthocas.cli.output import note, print_json, print_rows, terminal_monitor
@@ -47,6 +45,9 @@ from orthocas.tools.progress import Monitor
 
 _FILES = ("trajectory.npz", "coordinates.png", "report.json")
 CVODES = "cvodes"  #: the default plant
+_NOISE = (
+    'Standard deviation of the sensors, "position,velocity" [rad], [rad/s], or "position,velocity,seed"; needs --rate.'
+)
 _FAILED = (Outcome.DIVERGED, Outcome.LOST)  # the input was valid, but the run failed: exit code 1
 
 
@@ -60,10 +61,7 @@ def simulate(
     out: Annotated[Path, typer.Option("--out", help="Folder for the run, its pictures and the report.")],
     settings: dict[str, str],
     limit: Limit = None,
-    rate: Annotated[
-        float | None,
-        typer.Option("--rate", parser=parse_number, help="Control rate [Hz]; default: continuous control."),
-    ] = None,
+    rate: Annotated[float | None, Number("--rate", help="Control rate [Hz]; default: continuous control.")] = None,
     plant: Annotated[
         str, typer.Option("--plant", help="Simulator: cvodes, or mujoco (needs --rate and the extra [mujoco]).")
     ] = CVODES,
@@ -71,32 +69,17 @@ def simulate(
         bool,
         typer.Option("--supervised", help="Run the supervised law of the generated C (needs --rate and a C compiler)."),
     ] = False,
-    compiled: Annotated[
-        bool, typer.Option("--compiled", help="Compile law and robot first: for long runs; needs a C compiler.")
-    ] = False,
     mass_factor: Annotated[
-        float | None,
-        typer.Option(
-            "--mass-factor", parser=parse_number, help="True masses divided by those of the controller's model."
-        ),
+        float | None, Number("--mass-factor", help="True masses divided by those of the controller's model.")
     ] = None,
     friction: Annotated[
         str | None, typer.Option("--friction", help='Joint friction, "viscous,coulomb" [N m s/rad], [N m].')
     ] = None,
-    noise: Annotated[
-        str | None,
-        typer.Option(
-            "--noise", help='Standard deviation of the sensors, "position,velocity" [rad], [rad/s]; needs --rate.'
-        ),
-    ] = None,
-    seed: Annotated[
-        int | None, typer.Option("--seed", parser=parse_whole_number, help="Seed of the noise; default: 0.")
-    ] = None,
+    noise: Annotated[str | None, typer.Option("--noise", help=_NOISE)] = None,
     animation: Annotated[
         str, typer.Option("--animation", help="Format of the animation: gif, mp4 (needs ffmpeg) or none.")
     ] = "gif",
     collisions: Solids = None,
-    srdf: DisabledPairs = None,
     force: Force = False,
     json: AsJson = False,
 ) -> None:
@@ -120,14 +103,13 @@ def simulate(
         loaded.function("xi")
         plan = read_steps(steps, loaded)
         law = build_controller(controller, loaded, settings, limit)
-    solids = read_solids(loaded.problem.robot, collisions, srdf)
+    solids = read_solids(loaded.problem.robot, collisions)
     conditions = {
         "control_rate": rate,
         "plant": _build_plant(plant, loaded.problem.robot, mass_factor),
         "friction": None if friction is None else Friction(*parse_numbers("--friction", friction, 2).tolist()),
-        "noise": _build_noise(law, noise, seed, rate),
+        "noise": _build_noise(law, noise, rate),
         "safety": Safety.of(law) if supervised else None,
-        "compiled": compiled,
     }
     # The run, its files and its pictures; Ctrl-C keeps what there is.
     begin = time.perf_counter()
@@ -172,18 +154,16 @@ def _build_plant(plant: str, model: Robot, mass_factor: float | None) -> Robot |
     return MuJoCo(robot) if plant == MUJOCO else robot
 
 
-def _build_noise(law: Controller, text: str | None, seed: int | None, rate: float | None) -> Noise | None:
-    """The noise of the sensors; raises InvalidValueError for an option that would be ignored."""
+def _build_noise(law: Controller, text: str | None, rate: float | None) -> Noise | None:
+    """The noise of the sensors; raises InvalidValueError for a law that does not measure what is noisy."""
     if text is None:
-        if seed is not None:
-            raise OptionError("--seed requires --noise: nothing else is random")
         return None
     if rate is None:
         raise OptionError("--noise requires --rate: white noise needs control ticks")
-    position, velocity = parse_numbers("--noise", text, 2).tolist()
+    position, velocity, *seed = parse_numbers("--noise", text, 3 if text.count(",") == 2 else 2).tolist()
     if law.command == "velocity" and velocity != 0:
         raise InvalidValueError("--noise", text, f"a velocity deviation of 0, because {law.name} measures no velocity")
-    return Noise(position, velocity, 0 if seed is None else seed)
+    return Noise(position, velocity, int(seed[0]) if seed and seed[0].is_integer() else seed[0] if seed else 0)
 
 
 def _run(law: Controller, plan: Plan, conditions: dict[str, Any], monitor: Monitor) -> Trajectory:

@@ -15,7 +15,7 @@ import orthocas as oc
 from orthocas.errors import PathFileError
 from orthocas.paths.tool_path import read_path
 
-LIMITS = ("--velocity-limit", "1,1.5,2", "--acceleration-limit", "4")
+LIMITS = ("--velocity-limit", "1,1.5,2")
 
 
 def waypoints(chart: oc.Chart) -> np.ndarray:
@@ -38,7 +38,7 @@ def test_motion_is_that_of_python(run: Run, chart: oc.Chart) -> None:
     assert (code, err) == (0, "")
     report, expected = (
         json.loads(out),
-        oc.follow(chart, waypoints(chart), velocity_limits=[1, 1.5, 2], acceleration_limits=4),
+        oc.follow(chart, waypoints(chart), velocity_limits=[1, 1.5, 2]),
     )
     with Path("q.csv").open(newline="") as stream:
         table = np.array(list(csv.reader(stream))[1:], dtype=float)

@@ -195,7 +195,7 @@ def test_what_cannot_be_shown_is_refused(shown: object, error: type[Exception], 
     [
         (["nothing.orthocas"], "nothing.orthocas"),
         (["a.orthocas", "--port", "99999"], "port is 99999, expected"),
-        (["a.orthocas", "--host", "203.0.113.7"], "expected an address of this machine"),
+        (["a.orthocas", "--port", "203.0.113.7:0"], "expected an address of this machine"),
         (["a.orthocas", "--path", "p.csv", "--export", "page.html"], "--path is for live pages of charts"),
         (["iiwa", "--path", "p.csv"], "--path is for live pages of charts"),
         (["q.csv"], "give --chart or --robot"),
