@@ -20,10 +20,10 @@ from orthocas.cli.options import (
     spread_options,
 )
 from orthocas.cli.output import note, print_json, print_rows
-from orthocas.codegen.check import AgreementCheck, check_c
+from orthocas.codegen.check import check_c
 from orthocas.codegen.export import LIBRARIES
 from orthocas.codegen.export import export as export_chart
-from orthocas.codegen.generate import GeneratedC, generate_c
+from orthocas.codegen.generate import generate_c
 from orthocas.control.controller import Controller, Setting, law_names, law_of
 from orthocas.errors import LawWarning, OptionError
 from orthocas.robots.capsules import fit_capsules
@@ -111,11 +111,30 @@ def codegen(
         pairs = listed([f"{first} and {second}" for first, second in capsules.dropped])
         remarks.append(f"not checked in C, because their capsules touch in every posture tried: {pairs}")
     agreement = check_c(generated, loaded, law) if check else None
-    report = _build_report(generated, agreement)
+    # What was written, and how far it is from Python.
+    source = generated.folder / f"{generated.name}.c"
+    lines, differences = len(source.read_text().splitlines()), {} if agreement is None else agreement.differences
     if json:
+        report = {
+            "name": generated.name,
+            "source": str(source),
+            "lines": lines,
+            "stack_bytes": generated.stack_bytes,
+            "checked_states": None if agreement is None else agreement.states,
+            "compilers": None if agreement is None else list(agreement.compilers),
+            "relative_differences": None if agreement is None else differences,
+        }
         print_json(report)
     else:
-        print_rows(_format_rows(report), "" if check else f"cmake -S {out} -B {out}/build && cmake --build {out}/build")
+        rows = {"library": f"{generated.name}: {lines} lines of C99, {source}"}
+        rows["stack"] = f"{generated.stack_bytes} bytes at most per call"
+        if agreement is not None and differences:
+            worst = max(differences, key=lambda name: differences[name])
+            rows["checked"] = (
+                f"{agreement.states} states with {' and '.join(agreement.compilers)}, "
+                f"largest relative difference {differences[worst]:.1e} ({worst})"
+            )
+        print_rows(rows, "" if check else f"cmake -S {out} -B {out}/build && cmake --build {out}/build")
     for remark in remarks:
         note(remark)
 
@@ -138,33 +157,6 @@ def _write_tracker(file: Path, out: Path, name: str | None, force: bool, json: b
         print_json(data)
     else:
         print_rows({"tracker": f"{data['lines']} lines of C99, {source}", "header": str(header)})
-
-
-def _build_report(generated: GeneratedC, agreement: AgreementCheck | None) -> dict[str, Any]:
-    source = generated.folder / f"{generated.name}.c"
-    return {
-        "name": generated.name,
-        "source": str(source),
-        "lines": len(source.read_text().splitlines()),
-        "stack_bytes": generated.stack_bytes,
-        "checked_states": None if agreement is None else agreement.states,
-        "compilers": None if agreement is None else list(agreement.compilers),
-        "relative_differences": None if agreement is None else agreement.differences,
-    }
-
-
-def _format_rows(report: dict[str, Any]) -> dict[str, str]:
-    rows = {
-        "library": f"{report['name']}: {report['lines']} lines of C99, {report['source']}",
-        "stack": f"{report['stack_bytes']} bytes at most per call",
-    }
-    if differences := report["relative_differences"]:
-        worst = max(differences, key=differences.get)
-        rows["checked"] = (
-            f"{report['checked_states']} states with {' and '.join(report['compilers'])}, "
-            f"largest relative difference {differences[worst]:.1e} ({worst})"
-        )
-    return rows
 
 
 def require_settings(name: str, settings: Mapping[str, str]) -> None:

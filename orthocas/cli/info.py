@@ -89,7 +89,14 @@ def info(
         rows = {name: _format(value, name) for name, value in data.items() if name not in tables}
         print_rows(rows, "" if branches else then)
         if branches:
-            print_table(_tabulate_branches(data), f"{then} --task pose --domain branch")
+            # Name, share, the clearance that a wide chart needs if it is lower, and a posture.
+            lower = data.get("clearance_at_most", {})
+            table = [("branch", "share", *(("clearance at most",) if lower else ()), "a posture")]
+            for name, share in data["branches"].items():
+                posture = ", ".join(f"{value:.2f}" for value in data["postures"][name])
+                clearance = (_format(lower.get(name, "default")),) if lower else ()
+                table.append((name, percent(share), *clearance, posture))
+            print_table(table, f"{then} --task pose --domain branch")
 
 
 def _load_chart(target: str) -> "Chart":
@@ -166,22 +173,6 @@ def _describe_collisions(collisions: Collisions | None, draw: Callable[[int, int
         "touching_pair" if found.touching else "nearest_pair": list(found.pair),
         "least_distance": found.deepest,
     }
-
-
-def _tabulate_branches(data: dict[str, Any]) -> list[tuple[str, ...]]:
-    """The branches as a table: name, share, the clearance that a wide chart needs if it is lower, and a posture."""
-    lower = data.get("clearance_at_most", {})
-    head = ("branch", "share", *(("clearance at most",) if lower else ()), "a posture")
-    rows = [
-        (
-            name,
-            percent(share),
-            *((_format(lower.get(name, "default")),) if lower else ()),
-            ", ".join(f"{value:.2f}" for value in data["postures"][name]),
-        )
-        for name, share in data["branches"].items()
-    ]
-    return [head, *rows]
 
 
 def _describe_problem(problem: Problem) -> dict[str, Any]:

@@ -1,6 +1,7 @@
 """`orthocas simulate`: a controller in the coordinates of a chart, run in closed loop."""
 
 import time
+from collections.abc import Iterator
 from functools import partial
 from math import isfinite
 from pathlib import Path
@@ -29,7 +30,6 @@ from orthocas.control.reference import Reference
 from orthocas.control.safety import Safety
 from orthocas.errors import ArchiveError, Interrupted, InvalidValueError, OptionError, SingularTaskError
 from orthocas.robots.collisions import Collisions
-from orthocas.robots.robot import Robot
 from orthocas.simulation.disturbances import Friction, Noise, Plan, read_steps
 from orthocas.simulation.figure import FORMATS, require_format, save_animation, trajectory_figure, units_of
 from orthocas.simulation.mujoco_plant import MUJOCO, MuJoCo
@@ -41,7 +41,6 @@ from orthocas.tools.display import percent
 from orthocas.tools.files import is_listed, open_output_folder, publish, require_replaceable_files, require_writable
 from orthocas.tools.interrupts import INTERRUPTED, deferred
 from orthocas.tools.json import clean, write_json
-from orthocas.tools.progress import Monitor
 
 _FILES = ("trajectory.npz", "coordinates.png", "report.json")
 CVODES = "cvodes"  #: the default plant
@@ -86,15 +85,7 @@ def simulate(
     """Run a controller in a chart's coordinates; write the run, pictures, an animation and a report."""
     # What can be refused is refused before the chart is read.
     require_settings(controller, settings)
-    for option, value in {"--mass-factor": mass_factor, "--friction": friction}.items():
-        if value is not None and law_of(controller).command != "torque":
-            takers = ", ".join(name for name in CONTROLLERS if law_of(name).command == "torque")
-            raise OptionError(f"{controller} has no {option}, which belongs to {takers}")
-    require_known("plant", plant, (CVODES, MUJOCO))
-    if plant == MUJOCO and rate is None:
-        raise OptionError("--plant mujoco requires --rate: MuJoCo runs with a sampled controller")
-    if supervised and rate is None:
-        raise OptionError("--supervised requires --rate: a supervised law runs tick by tick")
+    _check_plant(controller, plant, rate, supervised, {"--mass-factor": mass_factor, "--friction": friction})
     _check_folder(out, animation, force)
     # CasADi may lose Ctrl-C while it builds functions.
     with deferred():
@@ -104,9 +95,10 @@ def simulate(
         plan = read_steps(steps, loaded)
         law = build_controller(controller, loaded, settings, limit)
     solids = read_solids(loaded.problem.robot, collisions)
-    conditions = {
+    robot = None if mass_factor is None else loaded.problem.robot.with_scaled_masses(mass_factor)
+    conditions: dict[str, Any] = {
         "control_rate": rate,
-        "plant": _build_plant(plant, loaded.problem.robot, mass_factor),
+        "plant": MuJoCo(robot) if plant == MUJOCO else robot,
         "friction": None if friction is None else Friction(*parse_numbers("--friction", friction, 2).tolist()),
         "noise": _build_noise(law, noise, rate),
         "safety": Safety.of(law) if supervised else None,
@@ -114,7 +106,10 @@ def simulate(
     # The run, its files and its pictures; Ctrl-C keeps what there is.
     begin = time.perf_counter()
     with terminal_monitor() as monitor:
-        run = _run(law, plan, conditions, monitor)
+        try:
+            run = run_closed_loop(law, plan.reference, plan.q_start, pushes=plan.pushes, monitor=monitor, **conditions)
+        except Interrupted as stop:
+            run = stop.result
         finish = partial(_finish, law, loaded, plan, run, time.perf_counter() - begin, out, force)
         interrupted = run.outcome is Outcome.INTERRUPTED
         try:
@@ -130,11 +125,25 @@ def simulate(
         print_json(report)
     else:
         print_rows(format_report(report, loaded.problem) | {"files": str(out)}, f"orthocas view {out} --chart {chart}")
-    _print_notes(law, report, interrupted)
+    for remark in (*law.remarks(), *_list_remarks(report, interrupted)):
+        note(remark)
     if solids is not None:
         note(_find_contact(solids, run))
     if code := INTERRUPTED if interrupted else int(run.outcome in _FAILED):
         raise typer.Exit(code)
+
+
+def _check_plant(controller: str, plant: str, rate: float | None, supervised: bool, of_torques: dict[str, Any]) -> None:
+    """Refuse options that do not fit the law, or require a rate of ticks."""
+    for option, value in of_torques.items():
+        if value is not None and law_of(controller).command != "torque":
+            takers = ", ".join(name for name in CONTROLLERS if law_of(name).command == "torque")
+            raise OptionError(f"{controller} has no {option}, which belongs to {takers}")
+    require_known("plant", plant, (CVODES, MUJOCO))
+    if plant == MUJOCO and rate is None:
+        raise OptionError("--plant mujoco requires --rate: MuJoCo runs with a sampled controller")
+    if supervised and rate is None:
+        raise OptionError("--supervised requires --rate: a supervised law runs tick by tick")
 
 
 def _check_folder(out: Path, animation: str, force: bool) -> None:
@@ -148,12 +157,6 @@ def _check_folder(out: Path, animation: str, force: bool) -> None:
     require_replaceable_files(out, names, force)
 
 
-def _build_plant(plant: str, model: Robot, mass_factor: float | None) -> Robot | MuJoCo | None:
-    """The true robot, or MuJoCo with it; None if it is the controller's model."""
-    robot = None if mass_factor is None else model.with_scaled_masses(mass_factor)
-    return MuJoCo(robot) if plant == MUJOCO else robot
-
-
 def _build_noise(law: Controller, text: str | None, rate: float | None) -> Noise | None:
     """The noise of the sensors; raises InvalidValueError for a law that does not measure what is noisy."""
     if text is None:
@@ -164,15 +167,6 @@ def _build_noise(law: Controller, text: str | None, rate: float | None) -> Noise
     if law.command == "velocity" and velocity != 0:
         raise InvalidValueError("--noise", text, f"a velocity deviation of 0, because {law.name} measures no velocity")
     return Noise(position, velocity, int(seed[0]) if seed and seed[0].is_integer() else seed[0] if seed else 0)
-
-
-def _run(law: Controller, plan: Plan, conditions: dict[str, Any], monitor: Monitor) -> Trajectory:
-    """Run the closed loop, or what there is of it at Ctrl-C."""
-    try:
-        return run_closed_loop(law, plan.reference, plan.q_start, pushes=plan.pushes, monitor=monitor, **conditions)
-    except Interrupted as stop:
-        run: Trajectory = stop.result
-        return run
 
 
 def _finish(
@@ -191,19 +185,16 @@ def _finish(
     return report
 
 
-def _print_notes(law: Controller, report: dict[str, Any], interrupted: bool) -> None:
-    """Print remarks about the run on standard error."""
-    for remark in law.remarks():
-        note(remark)
-    fallback = format_fallback(report)
-    if fallback is not None:
-        note(fallback)
+def _list_remarks(report: dict[str, Any], interrupted: bool) -> Iterator[str]:
+    """What went wrong in a run."""
+    if (fallback := format_fallback(report)) is not None:
+        yield fallback
     if report["outcome"] == Outcome.LOST.value:
-        note(f"the law lost the arm: {report['reason']}")
+        yield f"the law lost the arm: {report['reason']}"
     if report["outcome"] == Outcome.DIVERGED.value:
-        note(f"the run diverged: the integrator gave up at t = {report['duration']:.4g} s, the run so far is saved")
+        yield f"the run diverged: the integrator gave up at t = {report['duration']:.4g} s, the run so far is saved"
     if interrupted:
-        note("interrupted: the run so far is saved, without an animation")
+        yield "interrupted: the run so far is saved, without an animation"
 
 
 def _find_contact(collisions: Collisions, run: Trajectory) -> str:
@@ -274,9 +265,18 @@ def build_report(controller: Controller, chart: Chart, plan: Plan, seen: Traject
         "share_inside_domain": float(inside.mean()),
         "command": seen.kind,
         "largest_command": dict(zip(seen.joint_names, largest, strict=True)),
-        "energy": _evaluate_energy(seen) if seen.kind == "torque" and not bad.size else None,
+        "energy": None,
         "seconds": seconds,
     }
+    if seen.kind == "torque" and not bad.size:
+        report["energy"] = {
+            "storage_start": seen.storage[0],
+            "storage_end": seen.storage[-1],
+            "storage_largest": seen.storage.max(),
+            "storage_rise": seen.storage_rise,
+            # by the controller's damping [J]
+            "dissipated": seen.energy_balance[-1] - seen.storage[-1] + seen.storage[0],
+        }
     return dict(clean(report))
 
 
@@ -348,15 +348,11 @@ def _evaluate_angles(chart: Chart, seen: Trajectory) -> dict[str, Any] | None:
 def _evaluate_coupling(chart: Chart, reference: Reference, seen: Trajectory) -> dict[str, dict[str, float]]:
     """Commanded -> disturbed -> index, for quantities that were commanded alone."""
     coupling = coupling_index(chart, reference, seen)
-    return {
-        commanded: {
-            disturbed: float(coupling.index[i, j])
-            for i, disturbed in enumerate(coupling.labels)
-            if isfinite(coupling.index[i, j])
-        }
-        for j, commanded in enumerate(coupling.labels)
-        if np.isfinite(coupling.index[:, j]).any()
+    columns = {
+        commanded: {to: float(value) for to, value in zip(coupling.labels, column, strict=True) if isfinite(value)}
+        for commanded, column in zip(coupling.labels, coupling.index.T, strict=True)
     }
+    return {commanded: column for commanded, column in columns.items() if column}
 
 
 def _find_worst_couplings(index: dict[str, dict[str, float]], task: tuple[str, ...]) -> str:
@@ -370,18 +366,6 @@ def _find_worst_couplings(index: dict[str, dict[str, float]], task: tuple[str, .
             value, to, by = max(chosen)
             texts.append(f"{name} {value:.3g} ({to} <- {by})")
     return ", ".join(texts) or "see report.json"
-
-
-def _evaluate_energy(seen: Trajectory) -> dict[str, float]:
-    """Storage, and the energy dissipated by the controller's damping, [J]."""
-    taken = seen.energy_balance[-1] - seen.storage[-1] + seen.storage[0]
-    return {
-        "storage_start": seen.storage[0],
-        "storage_end": seen.storage[-1],
-        "storage_largest": seen.storage.max(),
-        "storage_rise": seen.storage_rise,
-        "dissipated": taken,
-    }
 
 
 def _format(value: float | None) -> str:
