@@ -88,6 +88,13 @@ class ViewRules:
     recorded_sweep: float = 5.0  #: of one coordinate [s]
     recorded_length: float = 120.0  #: longer motions are recorded faster [s]
 
+    far_links: float = 0.3  #: [m]: a full bar
+    near_links: float = 0.1  #: [m]: amber below
+    close_links: float = 0.02  #: [m]: red below, and the pair with it
+    link_line: float = 0.004  #: thickness of the line between nearest points [m]
+    touching: Colour = (214, 69, 69)
+    solid: Colour = (150, 158, 168)
+
     brand: Colour = (31, 95, 168)
     panel_widths: tuple[int, int] = (320, 300)  #: of readings and sliders [px]
     view_angle: float = 0.7  #: of the camera [rad]
@@ -199,20 +206,17 @@ def decimate(look: Look, most: int = RULES.triangles) -> Look:
     share = most / max(sum(len(solid.faces) for solids in look for solid in solids), 1)
     if share >= 1 or find_spec("fast_simplification") is None:
         return look
-    return [
-        [_decimate(solid, max(int(share * len(solid.faces)), RULES.mesh_triangles)) for solid in solids]
-        for solids in look
-    ]
 
+    def simplify(solid: Solid) -> Solid:
+        import trimesh  # half a second, for meshes of robot files only
 
-def _decimate(solid: Solid, count: int) -> Solid:
-    """A solid with about so many triangles."""
-    import trimesh  # half a second, for meshes of robot files only
+        count = max(int(share * len(solid.faces)), RULES.mesh_triangles)
+        if len(solid.faces) <= count:
+            return solid
+        mesh = trimesh.Trimesh(solid.vertices, solid.faces).simplify_quadric_decimation(face_count=count)
+        return replace(solid, vertices=np.asarray(mesh.vertices), faces=np.asarray(mesh.faces, dtype=np.intp))
 
-    if len(solid.faces) <= count:
-        return solid
-    mesh = trimesh.Trimesh(solid.vertices, solid.faces).simplify_quadric_decimation(face_count=count)
-    return replace(solid, vertices=np.asarray(mesh.vertices), faces=np.asarray(mesh.faces, dtype=np.intp))
+    return [[simplify(solid) for solid in solids] for solids in look]
 
 
 def build_stick_arm(tree: KinematicTree, thickness: float = 1.0, facets: int = RULES.facets) -> Look:
@@ -342,18 +346,11 @@ def _build_solid(
         radius, length = (float(read_numbers(shape, name, 1, (0.1,))[0]) for name in ("radius", "length"))
         return build_drum(radius, length / 2, colour)
     if shape.tag == "mesh":
-        return _load_mesh(path, shape, colour, missing)
+        try:
+            return Solid(*load_mesh(path, shape), colour)
+        except ValueError:
+            missing.append(shape.get("filename", ""))
     return None
-
-
-def _load_mesh(path: Path, shape: ElementTree.Element, colour: Colour, missing: list[str]) -> Solid | None:
-    """The triangles of a mesh file; None if it cannot be found or read."""
-    try:
-        vertices, faces = load_mesh(path, shape)
-    except ValueError:
-        missing.append(shape.get("filename", ""))
-        return None
-    return Solid(vertices, faces, colour)
 
 
 class BodyPoses:

@@ -20,8 +20,8 @@ from orthocas.errors import InvalidValueError, MissingExtraError, NoExpressionEr
 from orthocas.tools import checks
 from orthocas.viewer import Motion, export_page, window
 from orthocas.viewer.panel import ChartPanel, PlayerPanel, RobotPanel, format_drift
-from orthocas.viewer.player import PlayerPage
 from orthocas.viewer.session import Session
+from orthocas.viewer.view import PlayerPage
 from orthocas.viewer.window import Loop, is_local
 
 
