@@ -15,16 +15,7 @@ from orthocas.charts import quality
 from orthocas.charts.certificate import METHODS
 from orthocas.charts.chart_file import CHART
 from orthocas.charts.ready import card, load, names
-from orthocas.cli.options import (
-    AsJson,
-    ChartPath,
-    Force,
-    Number,
-    Solids,
-    Whole,
-    parse_whole_number,
-    read_solids,
-)
+from orthocas.cli.options import AsJson, ChartPath, Force, Number, Solids, Whole, parse_whole_number, read_solids
 from orthocas.cli.output import (
     build_reach_data,
     format_reach_rows,
@@ -109,8 +100,7 @@ def certify(
         Path | None, typer.Option("--out", help="Chart file to write, with the certificate; default: CHART itself.")
     ] = None,
     workers: Annotated[
-        str,
-        typer.Option("--workers", help="Number of processes, or the address of a Dask scheduler, tcp://host:8786."),
+        str, typer.Option("--workers", help="Number of processes, or the address of a Dask scheduler, tcp://host:8786.")
     ] = "1",
     force: Force = False,
     json: AsJson = False,

@@ -9,16 +9,7 @@ import typer
 
 from orthocas.charts.chart import Chart
 from orthocas.charts.ready import load
-from orthocas.cli.options import (
-    AsJson,
-    ChartPath,
-    Force,
-    Limit,
-    Solids,
-    parse_one_or_all,
-    read_solids,
-    spread_options,
-)
+from orthocas.cli.options import AsJson, ChartPath, Force, Limit, Solids, parse_one_or_all, read_solids, spread_options
 from orthocas.cli.output import note, print_json, print_rows
 from orthocas.codegen.check import check_c
 from orthocas.codegen.export import LIBRARIES

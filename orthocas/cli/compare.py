@@ -11,15 +11,7 @@ from orthocas.bases.registry import parse_parametrisation
 from orthocas.charts.figures import quality_figure, self_motion_figure
 from orthocas.charts.quality import evaluate
 from orthocas.charts.ready import load
-from orthocas.cli.options import (
-    AsJson,
-    Force,
-    ProblemOptions,
-    SampleCount,
-    Whole,
-    is_robot_file,
-    parse_weights,
-)
+from orthocas.cli.options import AsJson, Force, ProblemOptions, SampleCount, Whole, is_robot_file, parse_weights
 from orthocas.cli.output import format_reach_rows, note, print_json, print_table, terminal_monitor
 from orthocas.errors import Interrupted, InvalidValueError, printable
 from orthocas.fitting.compare import Comparison

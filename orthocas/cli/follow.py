@@ -9,16 +9,7 @@ import typer
 
 from orthocas.charts.chart import Chart
 from orthocas.charts.ready import load
-from orthocas.cli.options import (
-    AsJson,
-    ChartPath,
-    Force,
-    Number,
-    Solids,
-    parse_numbers,
-    parse_one_or_all,
-    read_solids,
-)
+from orthocas.cli.options import AsJson, ChartPath, Force, Number, Solids, parse_numbers, parse_one_or_all, read_solids
 from orthocas.cli.output import print_json, print_rows
 from orthocas.errors import InvalidValueError, OptionError
 from orthocas.paths.follow import HOLD, OBJECTIVE
@@ -38,16 +29,14 @@ def follow(
     path: Annotated[Path, typer.Argument(metavar="PATH.csv", help="Waypoints of the tool, see docs/how-to/paths.md.")],
     out: Annotated[Path, typer.Option("--out", help="CSV file for times, positions, velocities and accelerations.")],
     xi: Annotated[
-        str | None,
-        typer.Option("--xi", help="Extra coordinates: hold, schedule (columns of PATH.csv) or objective."),
+        str | None, typer.Option("--xi", help="Extra coordinates: hold, schedule (columns of PATH.csv) or objective.")
     ] = None,
     start: Annotated[
         str | None, typer.Option("--start", help='Joint positions near the start, "0,0.5,..."; default: the centre.')
     ] = None,
     period: Annotated[float, Number("--period", help="Distance of the time stamps [s].")] = 0.01,
     velocity: Annotated[
-        str | None,
-        typer.Option("--velocity-limit", help="Of all joints or each [rad/s], [m/s]; default: the robot's."),
+        str | None, typer.Option("--velocity-limit", help="Of all joints or each [rad/s], [m/s]; default: the robot's.")
     ] = None,
     obstacle: Annotated[
         list[str] | None,

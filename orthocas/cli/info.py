@@ -9,15 +9,7 @@ import typer
 
 from orthocas import problems
 from orthocas.bases.cyclic import cyclic_joints
-from orthocas.cli.options import (
-    AsJson,
-    ProblemName,
-    ProblemOptions,
-    Solids,
-    is_robot_file,
-    read_solids,
-    spread,
-)
+from orthocas.cli.options import AsJson, ProblemName, ProblemOptions, Solids, is_robot_file, read_solids, spread
 from orthocas.cli.output import build_reach_data, print_json, print_rows, print_table
 from orthocas.errors import OptionError, RobotError, SingularTaskError
 from orthocas.exact.involutivity import involutivity

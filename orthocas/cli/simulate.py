@@ -14,16 +14,7 @@ from orthocas.charts.chart import Chart
 from orthocas.charts.quality import evaluate
 from orthocas.charts.ready import load
 from orthocas.cli.codegen import CONTROLLERS, add_law_options, build_controller, require_settings
-from orthocas.cli.options import (
-    AsJson,
-    ChartPath,
-    Force,
-    Limit,
-    Number,
-    Solids,
-    parse_numbers,
-    read_solids,
-)
+from orthocas.cli.options import AsJson, ChartPath, Force, Limit, Number, Solids, parse_numbers, read_solids
 from orthocas.cli.output import note, print_json, print_rows, terminal_monitor
 from orthocas.control.controller import Controller, ControlStatus, law_of
 from orthocas.control.reference import Reference

@@ -30,8 +30,7 @@ def solve(
     x: Annotated[
         str,
         typer.Option(
-            "--x",
-            help='Task value "0.5,0,0.4,..."; of a pose also x,y,z,qw,qx,qy,qz, or a 4 x 4 matrix row by row.',
+            "--x", help='Task value "0.5,0,0.4,..."; of a pose also x,y,z,qw,qx,qy,qz, or a 4 x 4 matrix row by row.'
         ),
     ],
     xi: Annotated[str | None, typer.Option("--xi", help="Extra coordinates; default: near --start.")] = None,

@@ -16,10 +16,7 @@ from orthocas.tools.checks import Array, as_float_array, require_finite
 
 _Z = ca.SX([0, 0, 1])
 #: which of mass, mass times centre, and inertia xx, xy, xz, yy, yz, zz are not 0 after `_regroup`
-_OF_BODY = {
-    "revolute": [1, 2, 4, 5, 6, 8, 9],
-    "prismatic": list(range(10)),
-}
+_OF_BODY = {"revolute": [1, 2, 4, 5, 6, 8, 9], "prismatic": list(range(10))}
 PAYLOAD = 10  #: numbers of a payload
 _FORMS = "a mass, (4,) mass and centre, or (10,) mass, centre and inertia Ixx, Ixy, Ixz, Iyy, Iyz, Izz"
 _MATRIX = [0, 1, 2, 1, 3, 4, 2, 4, 5]  #: places of Ixx, Ixy, Ixz, Iyy, Iyz, Izz in the matrix
