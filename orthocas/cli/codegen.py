@@ -30,12 +30,13 @@ def add_law_options(for_codegen: bool) -> Callable[[Callable[..., None]], Callab
 
     The command gets those that were given, by name, as texts.
     """
-    options = {
-        name: (_build_option(name, setting), None)
-        for law in map(law_of, law_names())
-        for name, setting in law.options.items()
-        if for_codegen or not setting.codegen_only
-    }
+    options: dict[str, tuple[Any, None]] = {}
+    for law in map(law_of, law_names()):
+        for name, setting in law.options.items():
+            if for_codegen or not setting.codegen_only:
+                takers = _find_laws_with(name)
+                text = setting.help + ("" if len(takers) == len(law_names()) else f" For {', '.join(takers)}.")
+                options[name] = Annotated[str | None, typer.Option(_name_option(name, setting), help=text)], None
     return spread_options(
         "settings", options, lambda values: {name: text for name, text in values.items() if text is not None}
     )
@@ -43,12 +44,6 @@ def add_law_options(for_codegen: bool) -> Callable[[Callable[..., None]], Callab
 
 def _name_option(name: str, setting: Setting) -> str:
     return setting.option or f"--{name.replace('_', '-')}"
-
-
-def _build_option(name: str, setting: Setting) -> Any:
-    takers = _find_laws_with(name)
-    text = setting.help + ("" if len(takers) == len(law_names()) else f" For {', '.join(takers)}.")
-    return Annotated[str | None, typer.Option(_name_option(name, setting), help=text)]
 
 
 def _find_laws_with(setting: str) -> list[str]:

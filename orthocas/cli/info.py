@@ -169,6 +169,17 @@ def _describe_collisions(collisions: Collisions | None, draw: Callable[[int, int
 
 def _describe_problem(problem: Problem) -> dict[str, Any]:
     checked = check(problem)
+    try:
+        result = involutivity(problem)
+    except (SingularTaskError, RobotError) as error:
+        exact: dict[str, Any] = {"verdict": f"unknown whether exact coordinates exist: {error}"}
+    else:
+        exact = {
+            "involutivity_defect": {"mean": result.mean, "max": result.max},
+            "expected_leak_deg": result.expected_leak_deg,
+            "expected_angle_deg": result.expected_angle_deg,
+            "verdict": result.verdict,
+        }
     return {
         "problem": problem.name,
         "n": problem.n,
@@ -185,21 +196,8 @@ def _describe_problem(problem: Problem) -> dict[str, Any]:
         "near_singular_share": checked.singular_share,
         "half_turn_share": checked.half_turn_share,
         "most_singular_point": list(checked.most_singular_point),
-        **_describe_involutivity(problem),
+        **exact,
         **_describe_robot(problem.robot),
-    }
-
-
-def _describe_involutivity(problem: Problem) -> dict[str, Any]:
-    try:
-        result = involutivity(problem)
-    except (SingularTaskError, RobotError) as error:
-        return {"verdict": f"unknown whether exact coordinates exist: {error}"}
-    return {
-        "involutivity_defect": {"mean": result.mean, "max": result.max},
-        "expected_leak_deg": result.expected_leak_deg,
-        "expected_angle_deg": result.expected_angle_deg,
-        "verdict": result.verdict,
     }
 
 

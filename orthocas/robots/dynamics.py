@@ -243,23 +243,17 @@ def find_first_moments(tree: KinematicTree) -> tuple[list[int], tuple[int, ...]]
     return places, tuple(joints)
 
 
-def _unpack_inertials(tree: KinematicTree, inertials: ca.SX) -> list[_Body]:
-    """Bodies with the numbers of `collect_inertials`."""
-    bodies, start = [], 0
-    for kind in tree.body_kinds:
-        ten = ca.SX(10, 1)
-        for place in _OF_BODY[kind]:
-            ten[place], start = inertials[start], start + 1
-        bodies.append(_Body(ten[0], ten[1:4], ca.reshape(ten[[4, 5, 6, 5, 7, 8, 6, 8, 9]], 3, 3)))
-    return bodies
-
-
 def _build_bodies(tree: KinematicTree, payload: ca.SX | None, inertials: ca.SX | None) -> list[_Body]:
-    """The regrouped bodies, with the payload on the one that carries the tip."""
+    """The regrouped bodies, of the tree or with the numbers of `collect_inertials`; a payload is on that of the tip."""
     if inertials is None:
         bodies = [_Body(ca.SX(b.mass), constant(b.moment), constant(b.inertia)) for b in _regroup(tree)]
     else:
-        bodies = _unpack_inertials(tree, inertials)
+        bodies, start = [], 0
+        for kind in tree.body_kinds:
+            ten = ca.SX(10, 1)
+            for place in _OF_BODY[kind]:
+                ten[place], start = inertials[start], start + 1
+            bodies.append(_Body(ten[0], ten[1:4], ca.reshape(ten[[4, 5, 6, 5, 7, 8, 6, 8, 9]], 3, 3)))
     if payload is not None and tree.tip_parent >= 0:
         # Mass, mass times centre, and inertia about the body's origin, in the frame of the tip's body.
         body, R, p, mass = (

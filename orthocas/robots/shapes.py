@@ -173,7 +173,10 @@ class HullGeometry(Geometry):
         _, owners, counts = np.unique(hull.equations, axis=0, return_inverse=True, return_counts=True)
         for face in np.flatnonzero(counts > RULES.fan):
             own = owners.ravel() == face
-            ring = _order_around(corners, np.unique(faces[own]), hull.equations[own][0, :3])
+            # Its corners in their order along the edge of the face, in the plane of which it lies.
+            ring, normal = np.unique(faces[own]), hull.equations[own][0, :3]
+            u, v = ((corners[ring] - corners[ring].mean(axis=0)) @ scipy.linalg.null_space(normal[None])).T
+            ring = ring[np.argsort(np.arctan2(v, u))]
             faces = np.concatenate([faces[~own], _halve(ring)])
             owners = np.concatenate([owners.ravel()[~own], np.full(len(ring) - 2, face)])
         return cls(corners, faces)
@@ -198,13 +201,6 @@ class HullGeometry(Geometry):
         offsets = np.einsum("fi,fi->f", normals, corners[:, 0])
         outwards = np.sign(offsets - normals @ self.points.mean(axis=0))
         return np.asarray((outwards * (points @ normals.T - offsets) <= 0).all(axis=1))
-
-
-def _order_around(points: Array, ring: NDArray[np.intp], normal: Array) -> NDArray[np.intp]:
-    """The corners of a plane convex polygon, (K,) places among points, in their order along its edge."""
-    across = scipy.linalg.null_space(normal[None])
-    u, v = ((points[ring] - points[ring].mean(axis=0)) @ across).T
-    return ring[np.argsort(np.arctan2(v, u))]
 
 
 def _halve(ring: NDArray[np.intp]) -> NDArray[np.intp]:

@@ -106,14 +106,22 @@ def read_urdf(path: str | Path) -> tuple[pin.Model, dict[str, Mimic]]:
 
 
 @contextmanager
-def _own_packages(expander: Any) -> Iterator[None]:
-    """What xacrodoc finds for one file is not kept for others: two workspaces may have packages of one name."""
+def _own_packages(expander: Any, path: Path) -> Iterator[None]:
+    """Let xacrodoc find the ROS packages that lie in the same folder as the package of a file.
+
+    What it finds for one file is not kept for others: two workspaces may have packages of one name.
+    """
+    root = next((folder for folder in path.parents if (folder / "package.xml").exists()), None)
+    beside = [] if root is None else [str(found.parent) for found in sorted(root.parent.glob("*/package.xml"))]
     with _PACKAGES:
         kept = expander.packages._finder
         own = copy(kept)
         own.finder_funcs, own.package_cache = list(kept.finder_funcs), dict(kept.package_cache)
         expander.packages._finder = own
         try:
+            if beside:
+                # after what the user and ROS name
+                expander.packages.look_in(beside, priority=sys.maxsize)
             yield
         finally:
             expander.packages._finder = kept
@@ -137,11 +145,7 @@ def read_urdf_xml(path: str | Path) -> ElementTree.Element:
     expander: Any = import_module(name)
     try:
         if name == "xacrodoc":
-            with _own_packages(expander):
-                beside = _find_packages_beside(Path(path).resolve())
-                if beside:
-                    # after what the user and ROS name
-                    expander.packages.look_in(beside, priority=sys.maxsize)
+            with _own_packages(expander, Path(path).resolve()):
                 text = expander.XacroDoc.from_file(str(path)).to_urdf_string()
         else:
             text = expander.process_file(str(path)).toxml()
@@ -157,12 +161,6 @@ def read_urdf_xml(path: str | Path) -> ElementTree.Element:
         cause = f"{type(error).__name__}: {one_line(str(error))[:300]}{wanted}"
         raise RobotError(f"xacro cannot expand {path}: {cause}") from None
     return read_xml(path, "URDF", "robot", text.encode())
-
-
-def _find_packages_beside(path: Path) -> list[str]:
-    """Folders of the ROS packages that lie in the same folder as the package of a file."""
-    root = next((folder for folder in path.parents if (folder / "package.xml").exists()), None)
-    return [] if root is None else [str(found.parent) for found in sorted(root.parent.glob("*/package.xml"))]
 
 
 def read_xml(path: str | Path, kind: str, tag: str | None = None, data: bytes | None = None) -> ElementTree.Element:
