@@ -75,11 +75,11 @@ def build_inverse_dynamics(
     q: ca.SX,
     dq: ca.SX,
     ddq: ca.SX,
-    gravity: Array,
     payload: ca.SX | None = None,
     inertials: ca.SX | None = None,
+    gravity: Array | None = None,
 ) -> ca.SX:
-    """tau = M ddq + C dq + g, (n, 1) [N m] or [N], for a gravity acceleration (3,) in the world."""
+    """tau = M ddq + C dq + g, (n, 1) [N m] or [N]; a gravity acceleration (3,) takes the place of that of the tree."""
     joints = _build_transforms(tree, q)
     bodies = _build_bodies(tree, payload, inertials)
     # Mimic joints have the velocities S dq, and S^T of the torques of all joints acts on q.
@@ -88,7 +88,7 @@ def build_inverse_dynamics(
     #: angular velocity, angular acceleration matrix, linear acceleration
     states: dict[int, tuple[ca.SX, ca.SX, ca.SX]] = {}
     accelerations: dict[int, ca.SX] = {}
-    at_rest = (ca.SX(3, 1), ca.SX(3, 3), constant(-gravity))
+    at_rest = (ca.SX(3, 1), ca.SX(3, 3), constant(-(tree.gravity if gravity is None else gravity)))
     for i in tree.order:
         # The parent's motion in the axes of the body, then what the joint adds.
         omega_p, U_p, a_p = states.get(tree.parents[i], at_rest)
@@ -108,7 +108,7 @@ def build_inverse_dynamics(
 
 
 def build_forward_dynamics(
-    tree: KinematicTree, q: ca.SX, dq: ca.SX, tau: ca.SX, gravity: Array, inertials: ca.SX | None = None
+    tree: KinematicTree, q: ca.SX, dq: ca.SX, tau: ca.SX, inertials: ca.SX | None = None
 ) -> ca.SX:
     """ddq = M^-1 (tau - C dq - g), (n, 1), with M = L^T D L, from the tips to the base.
 
@@ -117,7 +117,7 @@ def build_forward_dynamics(
     tips_first = list(reversed(range(tree.n)))
     M = build_mass_matrix(tree, q, inertials=inertials)[tips_first, tips_first]
     D, LT, order = ca.ldl(M, False)
-    force = (tau - build_bias(tree, q, dq, gravity, inertials=inertials))[tips_first]
+    force = (tau - build_bias(tree, q, dq, inertials=inertials))[tips_first]
     return ca.ldl_solve(force, D, LT, order)[tips_first]
 
 
@@ -125,12 +125,17 @@ def build_bias(
     tree: KinematicTree,
     q: ca.SX,
     dq: ca.SX,
-    gravity: Array,
     payload: ca.SX | None = None,
     inertials: ca.SX | None = None,
+    gravity: Array | None = None,
 ) -> ca.SX:
     """C(q, dq) dq + g(q), (n, 1)."""
-    return build_inverse_dynamics(tree, q, dq, ca.SX(tree.n, 1), gravity, payload, inertials)
+    return build_inverse_dynamics(tree, q, dq, ca.SX(tree.n, 1), payload, inertials, gravity)
+
+
+def build_gravity(tree: KinematicTree, q: ca.SX, payload: ca.SX | None = None) -> ca.SX:
+    """g(q), (n, 1): the bias at rest."""
+    return build_bias(tree, q, ca.SX(tree.n, 1), payload)
 
 
 def build_zero_momentum(tree: KinematicTree, q: ca.SX) -> ca.SX:
@@ -150,7 +155,8 @@ def build_coriolis_product(tree: KinematicTree, q: ca.SX, v: ca.SX, w: ca.SX, pa
     C(q, v) w = (c(v + w) - c(v - w)) / 4 with c(v) = C(q, v) v. It is bilinear and symmetric in (v, w).
     """
     weightless = np.zeros(3)
-    return (build_bias(tree, q, v + w, weightless, payload) - build_bias(tree, q, v - w, weightless, payload)) / 4
+    plus, minus = (build_bias(tree, q, dq, payload, gravity=weightless) for dq in (v + w, v - w))
+    return (plus - minus) / 4
 
 
 @dataclass

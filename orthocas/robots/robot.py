@@ -651,7 +651,7 @@ def _check_tips(tip: str | None, tips: Sequence[str]) -> tuple[str, ...]:
 #: arguments and expressions
 _FUNCTIONS: dict[str, tuple[tuple[str, ...], Callable[..., ca.SX]]] = {
     "mass_matrix": (("q",), dynamics.build_mass_matrix),
-    "gravity": (("q",), lambda tree, q: dynamics.build_bias(tree, q, ca.SX(tree.n, 1), tree.gravity)),
+    "gravity": (("q",), dynamics.build_gravity),
     "frame_position": (("q",), lambda tree, q, *frames: kinematics.build_frame_pose(tree, q, *frames)[1]),
     "frame_rotation": (("q",), lambda tree, q, *frames: kinematics.build_frame_pose(tree, q, *frames)[0]),
     "frame_jacobian": (("q",), kinematics.build_frame_jacobian),
@@ -660,28 +660,14 @@ _FUNCTIONS: dict[str, tuple[tuple[str, ...], Callable[..., ca.SX]]] = {
     "tip_rotation": (("q",), lambda tree, q: kinematics.build_tip_pose(tree, q)[0]),
     "tip_jacobian": (("q",), kinematics.build_tip_jacobian),
     "joint_points": (("q",), kinematics.build_joint_points),
-    "bias": (("q", "dq"), lambda tree, q, dq: dynamics.build_bias(tree, q, dq, tree.gravity)),
-    "inverse_dynamics": (
-        ("q", "dq", "ddq"),
-        lambda tree, q, dq, ddq: dynamics.build_inverse_dynamics(tree, q, dq, ddq, tree.gravity),
-    ),
-    "forward_dynamics": (
-        ("q", "dq", "tau"),
-        lambda tree, q, dq, tau: dynamics.build_forward_dynamics(tree, q, dq, tau, tree.gravity),
-    ),
+    "bias": (("q", "dq"), dynamics.build_bias),
+    "inverse_dynamics": (("q", "dq", "ddq"), dynamics.build_inverse_dynamics),
+    "forward_dynamics": (("q", "dq", "tau"), dynamics.build_forward_dynamics),
     "coriolis_product": (("q", "v", "w"), dynamics.build_coriolis_product),
     "zero_momentum": (("q",), dynamics.build_zero_momentum),
-    "mass_matrix_with_payload": (("q", "payload"), dynamics.build_mass_matrix),
-    "gravity_with_payload": (
-        ("q", "payload"),
-        lambda tree, q, payload: dynamics.build_bias(tree, q, ca.SX(tree.n, 1), tree.gravity, payload),
-    ),
-    "bias_with_payload": (
-        ("q", "dq", "payload"),
-        lambda tree, q, dq, payload: dynamics.build_bias(tree, q, dq, tree.gravity, payload),
-    ),
-    "coriolis_product_with_payload": (("q", "v", "w", "payload"), dynamics.build_coriolis_product),
 }
+for _name in ("mass_matrix", "gravity", "bias", "coriolis_product"):
+    _FUNCTIONS[f"{_name}_with_payload"] = (*_FUNCTIONS[_name][0], "payload"), _FUNCTIONS[_name][1]
 _MATRICES = (
     "mass_matrix",
     "zero_momentum",
