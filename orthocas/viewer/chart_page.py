@@ -389,7 +389,15 @@ class ChartPage:
     def _show_chosen(self) -> None:
         """Draw another coordinate's fan and ends."""
         self._show()
-        self._show_fan()
+        fan = self._find_fan()
+        with self._server.atomic():
+            if fan is None:
+                self._ghosts.hide()
+                return
+            # What the arm can have of the fan.
+            fans = (fan.spread(RULES.ghosts), fan.spread(4 * RULES.ghosts))
+            few, many = (self.session.mirror(q[self.session.find_allowed(q)]) for q in fans)
+            self._ghosts.show(few, many, [f"{fan.label} = {value:.3f}" for value in (fan.xi[0], fan.xi[-1])])
 
     def _format_ends(self) -> str:
         """What ends the chosen coordinate, as a part of the readings; a mirrored arm ends elsewhere."""
@@ -400,17 +408,6 @@ class ChartPage:
         robot = self._chart.problem.robot
         lines = [f"{value:.3f}: {escape(describe_stop(stop, robot))}" for value, stop in ends]
         return f'<h4>ends of {escape(fan.label)}</h4><div class="about">{"<br>".join(lines)}</div>'
-
-    def _show_fan(self) -> None:
-        fan = self._find_fan()
-        with self._server.atomic():
-            if fan is None:
-                self._ghosts.hide()
-            else:
-                # What the arm can have of the fan.
-                fans = (fan.spread(RULES.ghosts), fan.spread(4 * RULES.ghosts))
-                few, many = (self.session.mirror(q[self.session.find_allowed(q)]) for q in fans)
-                self._ghosts.show(few, many, [f"{fan.label} = {value:.3f}" for value in (fan.xi[0], fan.xi[-1])])
 
     def _show_failure(self, error: Exception) -> None:
         self._rest()
