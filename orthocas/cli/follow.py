@@ -31,9 +31,6 @@ def follow(
     xi: Annotated[
         str | None, typer.Option("--xi", help="Extra coordinates: hold, schedule (columns of PATH.csv) or objective.")
     ] = None,
-    start: Annotated[
-        str | None, typer.Option("--start", help='Joint positions near the start, "0,0.5,..."; default: the centre.')
-    ] = None,
     period: Annotated[float, Number("--period", help="Distance of the time stamps [s].")] = 0.01,
     velocity: Annotated[
         str | None, typer.Option("--velocity-limit", help="Of all joints or each [rad/s], [m/s]; default: the robot's.")
@@ -81,7 +78,6 @@ def follow(
         loaded,
         waypoints,
         choice,
-        q_start=None if start is None else parse_numbers("--start", start),
         period=period,
         velocity_limits=None if velocity is None else parse_one_or_all("--velocity-limit", velocity),
         clearance=clearance,

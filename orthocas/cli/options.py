@@ -101,8 +101,8 @@ FORMER = {
     "--host": "the address to listen at is a value of --port, HOST:PORT",
     "--fastest": "set in Python: oc.control.PDPlus.on_chart(chart, fastest=20)",
     "--compliance": "set in Python: oc.control.PDPlus.on_chart(chart, compliance=1e-4)",
-    "--damping": "set in Python: oc.control.Impedance.on_chart(chart, damping='square_root')",
-    "--damping-stiffness": "simulations take it in Python: oc.control.PDPlus.on_chart(chart, damping_stiffness=50)",
+    "--damping-stiffness": "set in Python: oc.control.PDPlus.on_chart(chart, damping_stiffness=50)",
+    "--start": "the start of a motion is set in Python: oc.follow(chart, path, q_start=q)",
 }
 
 

@@ -144,9 +144,7 @@ class _OperationalSpace(LawOfChart):
         "delay": Setting("Delay from measurement to torque that the default stiffness is to bear [s]; default: 0."),
         "damping_ratio": Setting('"0.7", or "0.7,1,..." per quantity; default: 0.7.'),
         "coupling": Setting("coupled (default) or decoupled.", is_word=True),
-        "damping_stiffness": Setting(
-            "Design the damping for this stiffness, so that --stiffness may be 0 in places.", codegen_only=True
-        ),
+        "damping": Setting("double_diagonal (default) or square_root.", is_word=True),
         "model": Setting(
             "own (default), or given: mass matrix and torques become inputs.", is_word=True, codegen_only=True
         ),

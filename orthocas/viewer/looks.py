@@ -206,17 +206,20 @@ def decimate(look: Look, most: int = RULES.triangles) -> Look:
     share = most / max(sum(len(solid.faces) for solids in look for solid in solids), 1)
     if share >= 1 or find_spec("fast_simplification") is None:
         return look
+    return [
+        [_decimate(solid, max(int(share * len(solid.faces)), RULES.mesh_triangles)) for solid in solids]
+        for solids in look
+    ]
 
-    def simplify(solid: Solid) -> Solid:
-        import trimesh  # half a second, for meshes of robot files only
 
-        count = max(int(share * len(solid.faces)), RULES.mesh_triangles)
-        if len(solid.faces) <= count:
-            return solid
-        mesh = trimesh.Trimesh(solid.vertices, solid.faces).simplify_quadric_decimation(face_count=count)
-        return replace(solid, vertices=np.asarray(mesh.vertices), faces=np.asarray(mesh.faces, dtype=np.intp))
+def _decimate(solid: Solid, count: int) -> Solid:
+    """A solid with about so many triangles."""
+    import trimesh  # half a second, for meshes of robot files only
 
-    return [[simplify(solid) for solid in solids] for solids in look]
+    if len(solid.faces) <= count:
+        return solid
+    mesh = trimesh.Trimesh(solid.vertices, solid.faces).simplify_quadric_decimation(face_count=count)
+    return replace(solid, vertices=np.asarray(mesh.vertices), faces=np.asarray(mesh.faces, dtype=np.intp))
 
 
 def build_stick_arm(tree: KinematicTree, thickness: float = 1.0, facets: int = RULES.facets) -> Look:

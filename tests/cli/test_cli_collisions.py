@@ -64,7 +64,7 @@ def test_bad_files_and_former_options_are_refused(run: Run, arm: tuple[oc.Chart,
 
 
 def test_follow_refuses_contacts_and_says_which(run: Run, arm: tuple[oc.Chart, Collisions]) -> None:
-    options = ("a.orthocas", "p.csv", *LIMITS, "--start", "0.6,1.7,1.9", "--out", "q.csv", "--collisions", "arm.urdf")
+    options = ("a.orthocas", "p.csv", *LIMITS, "--out", "q.csv", "--collisions", "arm.urdf")
     assert run("follow", *options, "--json")[::2] == (0, "")
     chart = arm[0]
     x, y = chart.robot.frame_position(FREE, "link2")[:2]

@@ -77,7 +77,7 @@ def test_schedules_objectives_and_obstacles(run: Run, chart: oc.Chart) -> None:
         (["--sphere", "1,2,3,1"], "no such option: --sphere; use --obstacle sphere:X,Y,Z,RADIUS"),
         (["--obstacle", "plane:0,0,0,0,0,0"], "normal is [0.0, 0.0, 0.0], expected a direction"),
         (["--link-radius", "0.1"], "--link-radius requires --obstacle"),
-        (["--start", "1,2"], "q_start has shape (2,), expected (3,)"),
+        (["--start", "1,2"], "no such option: --start; the start of a motion is set in Python"),
         (["--period", "often"], "received 'often', expected a number"),
         (["--velocity-limit", "-1"], "velocity_limits of joint 'q1' is -1.0"),
         (["--out", "no/q.csv"], "folder no does not exist"),

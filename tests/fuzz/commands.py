@@ -57,7 +57,6 @@ _VALUES: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("--lock",), ("j1=0", "j1", "=", "j1=nan", "j1=x", "nowhere=1", "l1=0=1", "j1=1e300")),
     **dict.fromkeys(("--tool", "--payload", "--centre", "--half-width", "--weights", "--friction", "--noise"), _LISTS),
     **dict.fromkeys(("--stiffness", "--damping-ratio", "--feedback", "--limit"), _LISTS),
-    "--damping-stiffness": _LISTS,
     "--model": ("own", "given", "", "x"),
     "--gravity-compensation": ("law", "robot", "", "9.81"),
     "--inputs": ("payload", "payload,wrench,extra_torque", "payload,payload", ",", "", "mass"),
@@ -82,7 +81,7 @@ _VALUES: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("--share", "--margin-deg"), (*NUMBERS, "0.001")),
     **dict.fromkeys(("--splits", "--degree"), _COUNTS),
     "--out": ("out", "out/x/y", ".", "", "chart.orthocas", "/dev/null/x", "x" * 300),
-    **dict.fromkeys(("--coupling", "--animation"), ("coupled", "square_root", "none", "mp5", "")),
+    **dict.fromkeys(("--coupling", "--damping", "--animation"), ("coupled", "square_root", "none", "mp5", "")),
     "--task": ("position:x", "position", "polar", "axis:z", "axis:w", "pose:z", "position:xx", "position+axis", ""),
     "--metric": ("euclidean", "inertia", "identity"),
     "--param": _WORDS,
@@ -105,13 +104,7 @@ _KEPT = ("--export",)  # without it, the command serves until Ctrl-C
 _PROBLEM_OPTIONS = ("--tip", "--lock", "--tool", "--payload")
 _DOMAIN_OPTIONS = ("--task", "--metric", "--centre", "--home", "--half-width")
 _AUTO_OPTIONS = ("--domain", "--leak-deg", "--conditioning")
-_LAW_OPTIONS = (
-    "--stiffness",
-    "--damping-ratio",
-    "--coupling",
-    "--feedback",
-    "--limit",
-)
+_LAW_OPTIONS = ("--stiffness", "--damping-ratio", "--coupling", "--damping", "--feedback", "--limit")
 _RUN_OPTIONS = ("--rate", "--mass-factor", "--friction", "--noise", "--plant")
 _SOLIDS = ("--collisions",)
 _COMMANDS: dict[str, tuple[tuple[str, ...], dict[str, str], tuple[str, ...]]] = {  # targets, options, other options
@@ -166,7 +159,7 @@ _COMMANDS: dict[str, tuple[tuple[str, ...], dict[str, str], tuple[str, ...]]] = 
         _FILES,
         {"--out": "q.csv", "--velocity-limit": "1", "--period": "0.05"},
         (
-            *("--xi", "--start", "--obstacle"),
+            *("--xi", "--obstacle"),
             *("--link-radius", "--clearance", *_SOLIDS),
         ),
     ),
@@ -178,7 +171,7 @@ _COMMANDS: dict[str, tuple[tuple[str, ...], dict[str, str], tuple[str, ...]]] = 
     "codegen": (
         _FILES,
         {"--controller": "pd_plus", "--out": "out"},
-        (*_LAW_OPTIONS, "--damping-stiffness", "--name", "--model", "--gravity-compensation", "--inputs", *_SOLIDS),
+        (*_LAW_OPTIONS, "--name", "--model", "--gravity-compensation", "--inputs", *_SOLIDS),
     ),
 }
 
