@@ -80,6 +80,8 @@ _CORRIDOR = (
     "Domain: the surroundings of a path of postures, one a line, with the joint names in the first line; their radius "
     f"is --half-width [rad], default {RADIUS:g}."
 )
+_LEAK = "Largest leak for --domain auto [deg]; default 8."
+_CONDITIONING = "Smallest conditioning for --domain auto; default 0.2."
 _WEIGHTS = (
     '"lambda1,lambda2", up to lambda5; "NAME=WEIGHT" for terms of your own. With --domain branch the first two weigh '
     "leaks and mutual angles, and its own weights are the default."
@@ -101,12 +103,8 @@ class FitOptions:
     like: Annotated[str | None, typer.Option("--like", help=_LIKE)] = None
     exact: Annotated[bool, typer.Option("--exact", help=_EXACT)] = False
     corridor: Annotated[Path | None, typer.Option("--corridor", metavar="POSTURES.csv", help=_CORRIDOR)] = None
-    leak_deg: Annotated[float | None, Number("--leak-deg", help="Largest leak for --domain auto [deg]; default 8.")] = (
-        None
-    )
-    conditioning: Annotated[
-        float | None, Number("--conditioning", help="Smallest conditioning for --domain auto; default 0.2.")
-    ] = None
+    leak_deg: Annotated[float | None, Number("--leak-deg", help=_LEAK)] = None
+    conditioning: Annotated[float | None, Number("--conditioning", help=_CONDITIONING)] = None
     samples: SampleCount = None
     seed: Annotated[int, Whole("--seed", help="Seed of the samples and of random starts.")] = 0
     weights: Annotated[str, typer.Option("--weights", help=_WEIGHTS)] = WEIGHTS_TEXT
