@@ -503,12 +503,13 @@ def _build_momentum(tree: KinematicTree, with_payload: bool, with_gravity: bool)
     C^T dq is the gradient of the kinetic energy dq^T M dq / 2 by q: dM/dt dq = C dq + C^T dq.
     """
     q, dq, rest = ca.SX.sym("q", tree.n), ca.SX.sym("dq", tree.n), ca.SX(tree.n, 1)
-    payload = [ca.SX.sym("payload", dynamics.PAYLOAD)] if with_payload else []
-    p = dynamics.build_inverse_dynamics(tree, q, rest, dq, *payload, gravity=np.zeros(3))
+    payload = ca.SX.sym("payload", dynamics.PAYLOAD) if with_payload else None
+    p = dynamics.build_inverse_dynamics(tree, q, rest, dq, payload, gravity=np.zeros(3))
     rate = ca.gradient(ca.dot(dq, p) / 2, q)
     if with_gravity:
-        rate -= dynamics.build_bias(tree, q, rest, *payload)
-    return ca.Function("momentum", [q, dq, *payload], [ca.densify(p), ca.densify(rate)])
+        rate -= dynamics.build_bias(tree, q, rest, payload)
+    inputs = [q, dq] if payload is None else [q, dq, payload]
+    return ca.Function("momentum", inputs, [ca.densify(p), ca.densify(rate)])
 
 
 def _build_regressor(tree: KinematicTree) -> tuple[ca.Function, tuple[int, ...]]:
