@@ -34,8 +34,8 @@ class ClearBoxRules:
     fraction_samples: int = 20_000  #: of the box, for the fraction of it that is nonsingular
     default_samples: int = 4096  #: of the default box, to see whether it holds near-singular positions
     near: float = 0.03  #: relative singular value below which it does: charts of the whole box would fold there
-    default_bound: float = 0.15  #: least relative singular value of its part that is the default domain then
-    centre_share: float = 0.6  #: and the bound as a share of the value at the centre, if that is smaller
+    centre_share: float = 0.6  #: bound of its part that is the default domain then, as a share of the value at the centre
+    largest_bound: float = 0.2  #: and the largest such bound
     seed: int = 0
 
 
@@ -273,8 +273,8 @@ class ClearBox(Box):
 def default_domain(robot: Robot, task: Task) -> Box:
     """The domain of a problem that names none: `regular_box`, or its clear part if it holds near-singular positions.
 
-    There coordinates of the whole box would fold over. The bound is 0.15, or 60 % of the relative singular value of
-    the centre if that is less.
+    There coordinates of the whole box would fold over. The bound is 60 % of the relative singular value of the
+    centre, at most 0.2.
 
     Args:
         robot: the robot.
@@ -289,7 +289,7 @@ def default_domain(robot: Robot, task: Task) -> Box:
         values = measured.singular_values(sample_evenly(box, RULES.default_samples, RULES.seed))
         if np.nanmin(values) >= RULES.near:
             return box
-        bound = min(RULES.default_bound, RULES.centre_share * measured.singular_values(box.centre))
+        bound = min(RULES.largest_bound, RULES.centre_share * measured.singular_values(box.centre))
         return ClearBox(box, task, round(bound, 2), measured.scale)
     # a task that is singular in the centre too, or everywhere: `check` says what is wrong
     except OrthocasError:

@@ -70,9 +70,10 @@ def test_planar_arm_bends_its_joints() -> None:
 
 
 @pytest.mark.slow
-def test_arms_of_hobbyists_fit_without_folds_on_their_default_domain() -> None:
-    """The box of the SO-101 holds near-singular positions, so the default is its clear part; judged at own samples."""
-    robot = oc.Robot.from_name("so101")
+@pytest.mark.parametrize("name", ["so100", "so101"])
+def test_arms_of_hobbyists_fit_without_folds_on_their_default_domain(name: str) -> None:
+    """Their boxes hold near-singular positions, so the default is the clear part; judged at own samples."""
+    robot = oc.Robot.from_name(name)
     problem = oc.Problem(robot, oc.Task.position(robot))
     box = regular_box(robot, problem.task)
     low, high = problem.domain.bounds
