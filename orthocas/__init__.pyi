@@ -38,8 +38,8 @@ from orthocas.paths.chart_along import chart_along as chart_along
 from orthocas.paths.follow import follow as follow
 from orthocas.robots import obstacles as obstacles
 from orthocas.robots.capsules import fit_capsules as fit_capsules
+from orthocas.robots.obstacles import Scene as Scene
 from orthocas.robots.robot import Robot as Robot
-from orthocas.robots.scene import Scene as Scene
 from orthocas.simulation.run import simulate as simulate
 from orthocas.simulation.run import simulate_many as simulate_many
 from orthocas.tasks.branches import branches as branches

@@ -19,7 +19,7 @@ from orthocas.charts.regular_part import RegularPart
 from orthocas.errors import CertifyError, ChartFileError, InvalidValueError, OrthocasError
 from orthocas.exact.flow import GrownCoordinates
 from orthocas.exact.leaves import read_leaf
-from orthocas.robots.collision_data import KnownSolids, collisions_from_data, collisions_to_data
+from orthocas.robots.collision_files import KnownSolids, collisions_from_data, collisions_to_data
 from orthocas.robots.collisions import Collisions
 from orthocas.tasks.problem import FOREIGN, Problem, read_problem, write_problem
 from orthocas.tasks.samples import sample_uniform
