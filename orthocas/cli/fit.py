@@ -361,6 +361,8 @@ def _format_fit(result: Fit, report: Report, target: Path) -> dict[str, str]:
     coordinates, robot = result.chart.coordinates, result.chart.problem.robot
     rows = format_report_rows(report, result.chart)
     rows["robot"] = f"{robot.n} joints, {'tip' if len(robot.tips) == 1 else 'tips'} {listed(robot.tips)}"
+    if not isinstance(result, WideFit):
+        rows |= result.chart.problem.domain.describe_condition()
     # Adam follows a schedule, so its end is no failure
     planned = result.status is Status.ITERATION_LIMIT and result.chart.notes.get("solver") == "adam"
     ended = "all steps made" if planned else result.status.value

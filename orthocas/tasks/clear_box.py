@@ -34,7 +34,7 @@ class ClearBoxRules:
     fraction_samples: int = 20_000  #: of the box, for the fraction of it that is nonsingular
     default_samples: int = 4096  #: of the default box, to see whether it holds near-singular positions
     near: float = 0.03  #: relative singular value below which it does: charts of the whole box would fold there
-    centre_share: float = 0.6  #: bound of its part that is the default domain then, as a share of the value at the centre
+    centre_share: float = 0.6  #: bound of the part that is the default domain then, over the value at the centre
     largest_bound: float = 0.2  #: and the largest such bound
     seed: int = 0
 
