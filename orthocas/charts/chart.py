@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 
 from orthocas.charts.certificate import Certificate
 from orthocas.charts.clearance import Clearance
-from orthocas.charts.coordinates import CoordinateMap
+from orthocas.charts.coordinates import CoordinateMap, fill_coordinates
 from orthocas.charts.inverse import (
     Solutions,
     build_phi,
@@ -26,7 +26,6 @@ from orthocas.charts.inverse import (
     solve_rows,
 )
 from orthocas.charts.parts import FUNCTIONS, ChartParts
-from orthocas.charts.phi import fill_coordinates
 from orthocas.charts.point_quality import PointQuality, point_quality
 from orthocas.charts.self_motion import SelfMotion, XiRange, self_motion, xi_range
 from orthocas.charts.trackers import ReachingTracker, Tracker

@@ -372,3 +372,11 @@ class Coordinates:
 
 def _columns(values: Sequence[float] | Array, columns: int) -> ca.DM:
     return ca.DM(np.repeat(np.asarray(values, dtype=float)[:, None], columns, axis=1))
+
+
+def fill_coordinates(coordinates: CoordinateMap, name: str, results: Array, points: Array) -> None:
+    """Write xi or its Jacobian, by name, at points (N, n) to part of an array."""
+    if isinstance(coordinates, Coordinates):
+        coordinates.into(name, results, points)
+    else:
+        results[...] = getattr(coordinates, name)(points)

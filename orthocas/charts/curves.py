@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from orthocas.charts.curve_tracer import RULES, CurveTracer, Traces, solutions_of
 from orthocas.charts.descent import BoxedPhi
 from orthocas.charts.motion_kernel import SearchKernel, has_library
-from orthocas.charts.phi import largest
-from orthocas.charts.search import Starts
+from orthocas.charts.newton import Starts, largest
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, Indices
 from orthocas.tools.expressions import wrap_shortest

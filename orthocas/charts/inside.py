@@ -10,9 +10,7 @@ from numpy.typing import NDArray
 from orthocas.charts.curve_tracer import CurveTracer, Traces, without_turns
 from orthocas.charts.descent import RULES as DESCENT
 from orthocas.charts.descent import BoxedPhi, descend
-from orthocas.charts.newton import inverses
-from orthocas.charts.phi import largest
-from orthocas.charts.search import Starts
+from orthocas.charts.newton import Starts, inverses, largest
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, Indices
@@ -90,16 +88,15 @@ class Inside:
         Returns:
             q (N, n), and which of them have the task values, (N,).
         """
-        end = descend(self.boxed.task_equations, targets, self.boxed.of_points(q))
-        u, error = end.u, end.error
+        u, error = descend(self.boxed, targets, self.boxed.of_points(q), whole=False)
         left = np.flatnonzero(error > DESCENT.kept)
         if left.size:
             points = Points.of(self.starts.nearest(targets[left], RULES.starts, self.boxed.m), self.boxed, left)
-            end = descend(self.boxed.task_equations, targets[points.row], points.u)
+            ends, errors = descend(self.boxed, targets[points.row], points.u, whole=False)
             # what is written last stays
-            farthest_first = np.argsort(-end.error, kind="stable")
-            better = farthest_first[end.error[farthest_first] < error[points.row[farthest_first]]]
-            u[points.row[better]], error[points.row[better]] = end.u[better], end.error[better]
+            farthest_first = np.argsort(-errors, kind="stable")
+            better = farthest_first[errors[farthest_first] < error[points.row[farthest_first]]]
+            u[points.row[better]], error[points.row[better]] = ends[better], errors[better]
         return self.boxed.points(u), np.asarray(error <= DESCENT.kept)
 
     def nearest(self, targets: Array, q: Array) -> tuple[Array, Array]:
@@ -161,9 +158,9 @@ class Inside:
         components = q.shape[1], self.boxed.m
         near = [self.starts.nearest(targets[left], RULES.again, count) for count in components]
         points = Points.of(np.concatenate([q[None, left], *near]), self.boxed, left)
-        end = descend(self.boxed.task_equations, targets[points.row], points.u, RULES.descent)
-        kept = (end.error <= DESCENT.kept) & self.boxed.domain.contains(self.boxed.points(end.u))
-        return points.joined(Points(points.row[kept], end.u[kept], *np.zeros((2, kept.sum()))))
+        u, error = descend(self.boxed, targets[points.row], points.u, whole=False, most=RULES.descent)
+        kept = (error <= DESCENT.kept) & self.boxed.domain.contains(self.boxed.points(u))
+        return points.joined(Points(points.row[kept], u[kept], *np.zeros((2, kept.sum()))))
 
     def _slid(self, targets: Array, points: "Points", most: int) -> "Points":
         """Where slides from points end."""

@@ -9,25 +9,26 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.charts.coordinates import Coordinates, InvertibleMap
+from orthocas.charts.coordinates import Coordinates, InvertibleMap, fill_coordinates
 from orthocas.charts.curve_tracer import CurveTracer
 from orthocas.charts.curves import SelfMotionCurves
-from orthocas.charts.descent import RULES, BoxedPhi
+from orthocas.charts.descent import RULES, BoxedPhi, InDomain
 from orthocas.charts.inside import Inside
 from orthocas.charts.inverse import Inverse
 from orthocas.charts.motion_kernel import MotionKernel, SearchKernel, has_library
 from orthocas.charts.newton import (
     NEWTON,
     Continuation,
+    Differences,
     FewRows,
     Newton,
     OwnInverse,
+    PhiMap,
     PointFunctions,
+    Starts,
     inverse_function,
 )
-from orthocas.charts.phi import Differences, PhiMap, fill_coordinates, leave_over
-from orthocas.charts.search import InDomain, Starts
-from orthocas.charts.trackers import near_function
+from orthocas.charts.trackers import leave_over, near_function
 from orthocas.tasks.problem import measure_task_sizes
 from orthocas.tasks.relative import Relative
 from orthocas.tasks.samples import sample_uniform

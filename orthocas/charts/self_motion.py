@@ -13,8 +13,7 @@ from numpy.typing import ArrayLike
 
 from orthocas.charts.curve_tracer import solutions_of
 from orthocas.charts.motion_kernel import ENDLESS, FOLD, SINGULAR, WALL
-from orthocas.charts.newton import Newton
-from orthocas.charts.phi import counted_on, largest, require_no_turns
+from orthocas.charts.newton import Newton, largest
 from orthocas.errors import InvalidValueError, degrees_hint
 from orthocas.robots.collisions import Collisions
 from orthocas.tasks.domains import StopKind, Wall
@@ -146,7 +145,10 @@ def _find_extreme(
 
 def _set(chart: Chart, q: Array, samples: int, collisions: Collisions | None) -> SelfMotion:
     """Points on a lattice in xi, and the extent from its outermost points on."""
-    require_no_turns(chart.labels, chart.parts.turns, "a set of self-motions")
+    circles = [label for label, turn in zip(chart.labels, chart.parts.turns, strict=True) if turn > 0]
+    if circles:
+        came = f"one with circle-valued coordinates ({', '.join(circles)})"
+        raise InvalidValueError("chart", came, "real-valued ones for a set of self-motions")
     # the ranges at q size the lattice; its own outermost points may reach farther
     alone = xi_range(chart, q, collisions)
     points = filled(chart, q, alone, samples, collisions)
@@ -264,6 +266,14 @@ def branch_along(
     else:
         stop = Stop({ENDLESS: StopKind.ENDLESS, SINGULAR: StopKind.SINGULAR, FOLD: StopKind.FOLD}[way.stop])
     return Branch(way.q, way.length, stop, way.xi[:, None])
+
+
+def counted_on(rows: Array, turns: Array) -> Array:
+    """Values along a curve (N, k), continuous: periodic ones are continued by the shorter way from row to row."""
+    if not turns.any():
+        return rows
+    steps = wrap_shortest(np.diff(rows, axis=0), turns)
+    return np.asarray(rows[0] + np.concatenate([np.zeros((1, rows.shape[1])), np.cumsum(steps, axis=0)]))
 
 
 def too_far(chart: Chart, q: Array, wanted: Array) -> str:

@@ -13,8 +13,7 @@ from numpy.typing import ArrayLike
 from orthocas.charts.clearance import RULES as CLEARANCE
 from orthocas.charts.clearance import Clearance
 from orthocas.charts.descent import rooms_of
-from orthocas.charts.newton import NEWTON, Bound, PointFunctions, PointSolver
-from orthocas.charts.phi import PhiMap, leave_over
+from orthocas.charts.newton import NEWTON, Bound, PhiMap, PointFunctions, PointSolver
 from orthocas.errors import InvalidValueError, degrees_hint
 from orthocas.tasks.domains import Domain
 from orthocas.tools.batch import dense_function
@@ -306,6 +305,16 @@ def _guard(domain: Domain, limit: Array) -> ca.Function:
     if domain.condition is not None:
         outside = ca.fmax(outside, ca.if_else(ca.mmin(domain.condition.pivots(q)) > 0, -1, 1))
     return dense_function("guard", [before, q], [ca.vertcat(ca.norm_inf((q - before) / ca.DM(limit)), outside)])
+
+
+def leave_over(apart: float, tolerance: float, change: Array, turning: tuple[int, ...]) -> Array | None:
+    """What a loop leaves over in the joints: their change (n,), less full turns of those that turn without end.
+
+    None if phi at its ends differs by more than the tolerance, relative to the sizes of the components.
+    """
+    turns = np.zeros(len(change))
+    turns[list(turning)] = 2 * np.pi
+    return None if apart > tolerance else np.asarray(wrap_shortest(change, turns))
 
 
 @dataclass(frozen=True, slots=True)

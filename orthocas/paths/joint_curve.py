@@ -10,8 +10,7 @@ from scipy.interpolate import BSpline, CubicHermiteSpline
 from scipy.optimize import linprog
 from scipy.sparse import coo_array, vstack
 
-from orthocas.charts.newton import Newton
-from orthocas.charts.phi import largest
+from orthocas.charts.newton import Newton, largest
 from orthocas.errors import PathError, SolveError
 from orthocas.paths.tool_path import RULES
 from orthocas.tools.batch import Batched

@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 
 from orthocas.charts.chart import Chart
-from orthocas.charts.phi import counted_on
+from orthocas.charts.self_motion import counted_on
 from orthocas.errors import InvalidValueError, PathFileError, ShapeError
 from orthocas.robots.spatial import build_rotations
 from orthocas.tasks.relative import Relative
