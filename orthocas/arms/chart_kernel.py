@@ -150,7 +150,7 @@ class ChartPostures:
         begins = np.cumsum([0, *(len(part) for part in own)])
         return cls(
             np.ascontiguousarray(q),
-            np.ascontiguousarray(maps.places.of_postures(q), dtype=np.float32),
+            np.ascontiguousarray(maps.targets_of(q) / maps.place_sizes, dtype=np.float32),
             np.ascontiguousarray(np.vstack([*xi, np.zeros((len(free), r))]), dtype=np.float32),
             begins.astype(np.intc),
         )
@@ -323,7 +323,7 @@ def write_tracker(
     size = equations.size1_in(1)
     # How the header describes a target.
     words = f"its vector ({size})"
-    if maps.places.turned:
+    if maps.turned:
         words = "the rotation (3, 3) of the frame by columns"
         words = f"the position (3), then {words}" if size > 9 else words
     values = {
@@ -337,8 +337,8 @@ def write_tracker(
         "n": n,
         "m": task.m,
         "target": size,
-        "places": len(maps.place_scale),
-        "place_scale": maps.place_scale,
+        "places": len(maps.place_sizes),
+        "place_scale": 1 / maps.place_sizes,
         "charts": parts,
         "rules": {name: value for name, value in asdict(RULES).items() if name != "lifts"},
         "curve_rules": asdict(CURVES),

@@ -8,7 +8,6 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocas.arms.stored import StoredPostures
 from orthocas.native.curves import RULES
 from orthocas.native.kernels import generate_kernels
 from orthocas.native.libraries import keep_library, load_library, pointer
@@ -56,6 +55,20 @@ def evaluate_cubic(
     q = a + (3 * u * u - 2 * u**3) * d + h * ((u - 2 * u * u + u**3) * start + (u**3 - u * u) * end)
     slope = 6 * (u - u * u) * d + h * ((1 - 4 * u + 3 * u * u) * start + (3 * u * u - 2 * u) * end)
     return q, slope / np.maximum(np.linalg.norm(slope, axis=-1, keepdims=True), 1e-300)
+
+
+@dataclass(frozen=True, eq=False)
+class StoredPostures:
+    """Random postures within the limits, in the order of the branches, and where they are in x.
+
+    Those near a value of x are taken by |x - x_d|^2 det(J J^T)^(-1/m): then each self-motion curve gets a part of them
+    like its part of the length of all curves, whatever its distance from singular positions.
+    """
+
+    q: Array  #: (S, n)
+    places: NDArray[np.float32]  #: (k, S): distances between them are errors of x
+    weights: NDArray[np.float32]  #: of squared distances, (S,)
+    begins: NDArray[np.intc]  #: numbers of the first posture of each branch, and S
 
 
 def crossing_type(n: int) -> np.dtype[Any]:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.charts.certificate import Certificate
-from orthocas.charts.clearance import Clearance
+from orthocas.charts.clearance import Clearance, require_collisions
 from orthocas.charts.coordinates import CoordinateMap, fill_coordinates
 from orthocas.charts.inverse import (
     Solutions,
@@ -273,9 +273,7 @@ class Chart(Shown):
             ours: docs/how-to/inverse.md.
         """
         phi = build_phi(self, phi, x, xi)
-        if collisions is not None:
-            require_kind("collisions", collisions, Collisions)
-            collisions.require_for(self.problem.robot.tree)
+        require_collisions(collisions, self.problem.robot.tree)
         require_kind("all", all, bool)
         # all solutions of one phi
         if all:
@@ -564,9 +562,7 @@ class Chart(Shown):
         """
         from orthocas.charts.chart_file import write_chart  # all that files may hold, which a fit does not need
 
-        if collisions is not None:
-            require_kind("collisions", collisions, Collisions)
-            collisions.require_for(self.problem.robot.tree)
+        require_collisions(collisions, self.problem.robot.tree)
         target = as_path("path", path)
         write_chart(target, self.problem, self.coordinates, self.notes, self.certificate, force, collisions)
 

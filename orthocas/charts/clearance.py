@@ -31,6 +31,14 @@ class ClearanceRules:
 RULES = ClearanceRules()
 
 
+def require_collisions(collisions: object, tree: KinematicTree) -> None:
+    """Raise InvalidValueError for what is neither None nor a collision model of the robot of a tree."""
+    if collisions is not None:
+        require_kind("collisions", collisions, Collisions)
+        assert isinstance(collisions, Collisions)
+        collisions.require_for(tree)
+
+
 class Clearance:
     """Keeps a stream of postures at a distance from contacts.
 
@@ -49,8 +57,7 @@ class Clearance:
     """
 
     def __init__(self, collisions: Collisions, tree: KinematicTree, margin: float | None, avoid: float | None) -> None:
-        require_kind("collisions", collisions, Collisions)
-        collisions.require_for(tree)
+        require_collisions(collisions, tree)
         self.collisions, self._tree = collisions, tree
         self.margin = as_number("margin", RULES.margin if margin is None else margin)
         if not 0 <= self.margin < RULES.largest:

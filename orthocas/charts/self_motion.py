@@ -11,6 +11,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
+from orthocas.charts.clearance import require_collisions
 from orthocas.charts.curve_tracer import solutions_of
 from orthocas.charts.motion_kernel import ENDLESS, FOLD, SINGULAR, WALL
 from orthocas.charts.newton import Newton, largest
@@ -18,7 +19,7 @@ from orthocas.errors import InvalidValueError, degrees_hint
 from orthocas.robots.collisions import Collisions
 from orthocas.tasks.domains import StopKind, Wall
 from orthocas.tasks.problem import Problem
-from orthocas.tools.checks import Array, Indices, as_number, as_point, freeze_array, require_count, require_kind
+from orthocas.tools.checks import Array, Indices, as_number, as_point, freeze_array, require_count
 from orthocas.tools.display import Shown, listed, number_list
 from orthocas.tools.expressions import wrap_shortest
 
@@ -728,9 +729,8 @@ class Walls:
         self._low, self._high = domain.bounds
         self.solid = collisions is not None  #: whether there is something to hit
         self._curved = domain.walls
+        require_collisions(collisions, problem.robot.tree)
         if collisions is not None:
-            require_kind("collisions", collisions, Collisions)
-            collisions.require_for(problem.robot.tree)
             self._curved = (*domain.walls, Wall(StopKind.CONTACT, lambda q: float(collisions.distance(q).distance)))
         endless = np.isinf(self._low) & ~np.array(problem.robot.tree.prismatic)
         self.turning = endless  #: unbounded revolute joints, (n,): they are at the same place after a full turn

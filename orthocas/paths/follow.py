@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 
 from orthocas.charts.chart import Chart
+from orthocas.charts.clearance import require_collisions
 from orthocas.charts.self_motion import Walls, counted_on, xi_range
 from orthocas.errors import InvalidValueError, PathError, SolveError
 from orthocas.paths.joint_curve import JointCurve, LostCurve, PhiSolver, TimeLaw, compute_fastest_law, list_places
@@ -92,9 +93,7 @@ def follow(
     require_driven("following a path", chart.problem.robot.tree)
     # Raises for grown charts.
     chart.function("second_derivative")
-    if collisions is not None:
-        require_kind("collisions", collisions, Collisions)
-        collisions.require_for(chart.problem.robot.tree)
+    require_collisions(collisions, chart.problem.robot.tree)
     start = chart.problem.domain.home if q_start is None else as_point("q_start", q_start, chart.n)
     # limits of all joints, > 0 and finite
     most = chart.problem.robot.velocity_limits if velocity_limits is None else velocity_limits
