@@ -17,9 +17,9 @@ from orthocas.arms.maps import ArmMaps
 from orthocas.arms.self_motion import SelfMotions, find_motions
 from orthocas.arms.tracker import ArmTracker, TrackStatus
 from orthocas.charts.chart import Chart
-from orthocas.charts.clearance import Clearance, require_collisions
 from orthocas.charts.inverse import InverseStatus
 from orthocas.charts.ready import load, names
+from orthocas.charts.walls import Clearance, require_collisions
 from orthocas.codegen.generate import require_free_folder, require_name
 from orthocas.errors import BranchWarning, DomainError, InvalidValueError, NotRedundantError, ShapeError, warn_caller
 from orthocas.fitting.wide import fit_wide

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocas.arms.kernel import Curve, CurveKernel, StoredPostures, build_equations
-from orthocas.charts.self_motion import Stop
+from orthocas.charts.walls import Stop
 from orthocas.errors import InvalidValueError
 from orthocas.robots.robot import Robot
 from orthocas.tasks.branches import branches

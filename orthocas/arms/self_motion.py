@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from orthocas.arms.kernel import Curve, build_curvature, evaluate_cubic
 from orthocas.arms.maps import ArmMaps
-from orthocas.charts.self_motion import Stop
+from orthocas.charts.walls import Stop
 from orthocas.errors import InvalidValueError
 from orthocas.tasks.domains import StopKind
 from orthocas.tasks.metric import Metric, MetricSpec

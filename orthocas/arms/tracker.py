@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthocas.arms.chart_kernel import RULES, ChartKernel, tracker_type
-from orthocas.charts.clearance import Clearance
+from orthocas.charts.walls import Clearance
 from orthocas.errors import InvalidValueError, degrees_hint
 from orthocas.native.libraries import pointer
 from orthocas.tools.checks import Array, as_float_array, as_number, as_point, require_kind, require_shape

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.charts.certificate import Certificate
-from orthocas.charts.clearance import Clearance, require_collisions
 from orthocas.charts.coordinates import CoordinateMap, fill_coordinates
 from orthocas.charts.inverse import (
     Solutions,
@@ -29,6 +28,7 @@ from orthocas.charts.parts import FUNCTIONS, ChartParts
 from orthocas.charts.point_quality import PointQuality, point_quality
 from orthocas.charts.self_motion import SelfMotion, XiRange, self_motion, xi_range
 from orthocas.charts.trackers import ReachingTracker, Tracker
+from orthocas.charts.walls import Clearance, require_collisions
 from orthocas.errors import InvalidValueError
 from orthocas.robots.collisions import Collisions
 from orthocas.robots.robot import Robot

@@ -12,9 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthocas.charts.chart import Chart
 from orthocas.charts.chart_file import FREE
-from orthocas.charts.clearance import require_collisions
 from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.point_quality import Judged, WorstPoints, measure_held_speeds, pairs, worst_points
+from orthocas.charts.walls import require_collisions
 from orthocas.errors import InvalidValueError, SingularTaskError
 from orthocas.robots.collisions import Collisions
 from orthocas.tasks.samples import evaluate_samples, find_idle_joints, sample_uniform

@@ -10,10 +10,10 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.charts.clearance import RULES as CLEARANCE
-from orthocas.charts.clearance import Clearance
 from orthocas.charts.descent import rooms_of
 from orthocas.charts.newton import NEWTON, Bound, PhiMap, PointFunctions, PointSolver
+from orthocas.charts.walls import RULES as CLEARANCE
+from orthocas.charts.walls import Clearance
 from orthocas.errors import InvalidValueError, degrees_hint
 from orthocas.tasks.domains import Domain
 from orthocas.tools.batch import dense_function

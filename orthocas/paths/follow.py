@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 
 from orthocas.charts.chart import Chart
-from orthocas.charts.clearance import require_collisions
-from orthocas.charts.self_motion import Walls, counted_on, xi_range
+from orthocas.charts.self_motion import counted_on, xi_range
+from orthocas.charts.walls import Walls, require_collisions
 from orthocas.errors import InvalidValueError, PathError, SolveError
 from orthocas.paths.joint_curve import JointCurve, LostCurve, PhiSolver, TimeLaw, compute_fastest_law, list_places
 from orthocas.paths.joint_motion import JointMotion, Margins
