@@ -163,6 +163,7 @@ class CurveTracer:
         # what `_step` takes for each curve: where it is, tangent, bend, length of the step, and where it began
         state = np.concatenate([q0, t0, np.zeros((K, n)), np.full((K, 1), RULES.step / 2), q0, t0], axis=1)
         left, before = np.arange(K), np.zeros(K)
+        (low, high), room = self.boxed.domain.bounds, RULES.prismatic * self.boxed.domain.half_width
         for _ in range(RULES.most):
             found = self._step(state, x)[0]
             # a step counts if it hits the curve and hardly turns
@@ -181,7 +182,10 @@ class CurveTracer:
             # lengths follow success
             longer = np.where(turned > RULES.straight, np.minimum(1.6 * h, RULES.step), h)
             h[:] = np.where(good, longer, h / 2)
-            goes_on = ~around & (h > RULES.shortest) & self._slides_near(state[:, :n])
+            goes_on = ~around & (h > RULES.shortest)
+            # sliding joints in their ranges, or not far outside
+            if not self.turning.all():
+                goes_on &= (((state[:, :n] >= low - room) & (state[:, :n] <= high + room)) | self.turning).all(axis=1)
             if not goes_on.all():
                 state, x, left, before = state[goes_on], x[goes_on], left[goes_on], before[goes_on]
             if not left.size:
@@ -190,14 +194,6 @@ class CurveTracer:
         last = np.minimum(np.arange(count.max()), count[:, None] - 1)[:, :, None]
         points, tangents = (np.take_along_axis(part, last, axis=1) for part in (points, tangents))
         return points, tangents, count, closed
-
-    def _slides_near(self, q: Array) -> NDArray[np.bool_]:
-        """Whether sliding joints are in their ranges, or not far outside."""
-        if self.turning.all():
-            return np.ones(len(q), dtype=bool)
-        low, high = self.boxed.domain.bounds
-        room = RULES.prismatic * self.boxed.domain.half_width
-        return np.asarray((((q >= low - room) & (q <= high + room)) | self.turning).all(axis=1))
 
     def _on_circles(self, q: Array) -> Array:
         """Cosines and sines of revolute joints, and positions of the others: near one another where q (..., n) is."""

@@ -431,29 +431,22 @@ class SelfMotionCurves:
         return np.asarray(((q >= low) & (q <= high)).all(axis=1))
 
     def _take_ends(self, targets: Array, ends: "Ends", best: Nearest) -> None:
-        """The ends of arcs, of rows in which they may be nearest."""
+        """The ends of arcs, of rows in which they may be nearest: by halving what lies between inside and outside."""
         useful = np.flatnonzero(ends.least < best.distance[ends.row])
-        rows = ends.row[useful]
-        if rows.size:
-            q = self._end(targets[rows], ends.inside[useful], ends.outside[useful])
-            best.take(rows, q, np.abs(self._xi_left(targets[rows], q)))
-
-    def _end(self, targets: Array, inside: Array, outside: Array) -> Array:
-        """The last points of the domain between points of curves (M, n) inside and outside."""
-        x = targets[:, : self.boxed.m]
-        a, b = inside.copy(), outside.copy()
+        rows, a, b = ends.row[useful], ends.inside[useful], ends.outside[useful]
+        if not rows.size:
+            return
         # where a descent got lost on a joint without boundaries, the spacing of numbers is wider than that
         for _ in range(RULES.narrowings):
             if np.abs(b - a).max(initial=0.0) <= RULES.narrow:
                 break
-            along = b - a
-            middle = (a + b) / 2
+            along, middle = b - a, (a + b) / 2
             t = along / np.linalg.norm(along, axis=1, keepdims=True)
-            middle = middle + self.tracer.correct(x, middle, t)[0]
+            middle = middle + self.tracer.correct(targets[rows, : self.boxed.m], middle, t)[0]
             middle = np.where(np.isfinite(middle), middle, b)
             within = self._contains(middle)
             a, b = np.where(within[:, None], middle, a), np.where(within[:, None], b, middle)
-        return a
+        best.take(rows, a, np.abs(self._xi_left(targets[rows], a)))
 
     def _xi_left(self, targets: Array, q: Array) -> Array:
         """xi - xi(q), (N,)."""

@@ -121,11 +121,6 @@ class Attempt:
     suspicious: NDArray[np.bool_]  #: whether J may be singular there, (N,)
     inside: NDArray[np.bool_] | None = None  #: which rows lie inside the domain for certain, (N,); None: not looked at
 
-    @classmethod
-    def empty(cls, N: int, n: int) -> "Attempt":
-        """Room for N rows."""
-        return cls(np.empty((N, n)), np.empty((N, n)), np.zeros(N, dtype=np.int64), np.zeros(N, dtype=bool))
-
     def replace(self, rows: Indices, other: "Attempt") -> None:
         """Put the results of another search in some rows."""
         self.q[rows], self.residual[rows] = other.q, other.residual
@@ -207,9 +202,18 @@ class _Run:
         # halve the steps of rows whose error does not decrease
         left = np.flatnonzero(np.isfinite(steps).all(axis=1))
         for halvings in range(most + 1):
-            moved = self._try(rows[left], steps[left], 0.5**halvings)
-            goes_on[left[moved]] = True
-            left = left[~moved]
+            tried, share = rows[left], 0.5**halvings
+            q = self.q[tried] + share * steps[left]
+            residual = self._map.residual(self._targets[tried], q)
+            before, error = self.error[tried], largest(residual)
+            # a sufficient decrease, as for line searches; slow rows get a new J
+            better = error < (1 - NEWTON.decrease * share) * before
+            moved = tried[better]
+            self.q[moved], self.residual[moved], self.error[moved] = q[better], residual[better], error[better]
+            self.iterations[moved] += 1
+            self.stale[moved] = error[better] > NEWTON.keep * before[better]
+            goes_on[left[better]] = True
+            left = left[~better]
             # before that, rows with an old J ask for a new one, and rows that only rounding stops end
             if halvings == 0:
                 waiting = ~self._fresh[rows[left]]
@@ -219,19 +223,6 @@ class _Run:
                 break
         self._fresh[rows] = False
         return goes_on
-
-    def _try(self, rows: Indices, steps: Array, share: float) -> NDArray[np.bool_]:
-        """Take parts of steps where they reduce the error; returns where."""
-        q = self.q[rows] + share * steps
-        residual = self._map.residual(self._targets[rows], q)
-        before, error = self.error[rows], largest(residual)
-        # a sufficient decrease, as for line searches; slow rows get a new J
-        better = error < (1 - NEWTON.decrease * share) * before
-        moved = rows[better]
-        self.q[moved], self.residual[moved], self.error[moved] = q[better], residual[better], error[better]
-        self.iterations[moved] += 1
-        self.stale[moved] = error[better] > NEWTON.keep * before[better]
-        return better
 
     @property
     def suspicious(self) -> NDArray[np.bool_]:
@@ -466,7 +457,8 @@ class FewRows:
         """Search from starts (N, n)."""
         if len(targets) > NEWTON.few:
             return self._other(targets, starts)
-        attempt = Attempt.empty(*targets.shape)
+        steps, sure = np.zeros(len(targets), dtype=np.int64), np.zeros(len(targets), dtype=bool)
+        attempt = Attempt(np.empty(targets.shape), np.empty(targets.shape), steps, sure)
         # otherwise CasADi turns Ctrl-C into a RuntimeError, or swallows it
         with deferred():
             try:

@@ -269,8 +269,15 @@ class MotionLimits:
         """Raise PathError at the first place (P,) whose joint position (P, n) is lost or outside."""
         finite = np.flatnonzero(np.isfinite(q).all(axis=1))
         kept = finite[self.chart.problem.domain.contains(q[finite])]
-        if len(kept) < len(q):
-            raise self._build_error(path, s, q, int(np.setdiff1d(np.arange(len(q)), kept)[0]))
+        if len(kept) == len(q):
+            return
+        # what is wrong with the first of the others
+        k = int(np.setdiff1d(np.arange(len(q)), kept)[0])
+        if not np.isfinite(q[k]).all():
+            raise self.build_lost_error(path, LostCurve(s[:k], q[:k], float(s[k])))
+        where = path.describe_place(float(s[k]), self.chart.labels)
+        reason = f"it leaves the domain, stopped by {Walls(self.chart.problem).worst(q[k])}"
+        raise PathError(f"the path cannot be followed {where}: {reason}{self._describe_reach(q[max(k - 1, 0)])}")
 
     def check_contacts(self, path: ToolPath, motion: JointMotion) -> None:
         """Raise PathError where a pair may come nearer than the clearance, at time stamps or between them.
@@ -292,15 +299,6 @@ class MotionLimits:
             f"the path cannot be followed {where}: at {instant:.3f} s '{first}' and '{second}' {near}, "
             f"expected a distance above clearance = {self.clearance:g} m at and between all time stamps"
         )
-
-    def _build_error(self, path: ToolPath, s: Array, q: Array, k: int) -> PathError:
-        """What is wrong with the k-th joint position."""
-        last = max(k - 1, 0)
-        if not np.isfinite(q[k]).all():
-            return self.build_lost_error(path, LostCurve(s[:k], q[:k], float(s[k])))
-        where = path.describe_place(float(s[k]), self.chart.labels)
-        reason = f"it leaves the domain, stopped by {Walls(self.chart.problem).worst(q[k])}"
-        return PathError(f"the path cannot be followed {where}: {reason}{self._describe_reach(q[last])}")
 
     def build_lost_error(self, path: ToolPath, end: LostCurve) -> PathError:
         """The error for a path that ends before s = 1."""

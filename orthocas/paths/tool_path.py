@@ -118,9 +118,11 @@ class TaskSpline:
     def __init__(self, relative: Relative, s: Array, points: Array, sizes: Array) -> None:
         self._relative, self._s = relative, s
         rows = points
-        # Orientations as quaternions with signs that leave no jump.
+        # Orientations as quaternions, each nearer to the one before than its opposite is.
         if relative.turned:
-            p = continue_signs(Batched(relative.task.quaternion_function)(points)[0])
+            p = Batched(relative.task.quaternion_function)(points)[0]
+            turns = np.where((p[1:] * p[:-1]).sum(axis=1) < 0, -1.0, 1.0)
+            p = p * np.concatenate([[1.0], np.cumprod(turns)])[:, None]
             rows = np.hstack([points[:, : relative.first], p])
             sizes = np.concatenate([sizes[: relative.first], np.ones(4)])
         away = np.abs(rows[-1] - rows[0])
@@ -160,13 +162,6 @@ class TaskSpline:
             omega = 2 * _multiply_conjugate(p, slopes[1]) / square - growth * omega
         assert self._relative.task.turn is not None
         return np.concatenate([rows[order][..., :first], omega @ self._relative.task.turn.order.T], axis=-1)
-
-
-def continue_signs(quaternions: Array) -> Array:
-    """Quaternions (N, 4) with signs such that each is nearer to the one before than its opposite is."""
-    turns = np.where((quaternions[1:] * quaternions[:-1]).sum(axis=1) < 0, -1.0, 1.0)
-    signed: Array = quaternions * np.concatenate([[1.0], np.cumprod(turns)])[:, None]
-    return signed
 
 
 def _multiply_conjugate(a: Array, b: Array) -> Array:
