@@ -187,7 +187,7 @@ class ChartKernel:
         # Which charts may answer.
         flags = np.zeros(len(self.charts), dtype=np.int8)
         flags[list(allowed)] = 1
-        solve, stored, whole = self._c.solve_rows, self.postures.in_c, self._range
+        solve, stored, whole = self.library.solve_rows, self.postures.in_c, self._range
         # Room for the points of all curves of a target, and for distances (float) of the stored postures.
         room_size = CURVES.nodes * (2 * n + 1) + (len(self.maps.stored.q) + 1) // 2
         inputs = [np.ascontiguousarray(part) for part in (targets, xi)]
@@ -219,7 +219,7 @@ class ChartKernel:
         flags[list(allowed)] = 1
         room = np.empty(CURVES.nodes * (2 * n + 1) + (len(self.maps.stored.q) + 1) // 2)
         q, owner = np.empty((RULES.every, n)), np.empty(RULES.every, dtype=np.intc)
-        count = self._c.solve_all(
+        count = self.library.solve_all(
             *(pointer(target), ctypes.c_double(xi), None if start is None else pointer(np.ascontiguousarray(start))),
             *(pointer(flags), ctypes.byref(self._range), CURVES.patience, pointer(room), CURVES.nodes),
             *(pointer(q), pointer(owner), RULES.every),
@@ -231,7 +231,7 @@ class ChartKernel:
     def build_targets(self, vectors: Array) -> Array:
         """As `TargetReader.build`, of contiguous vectors (N, m)."""
         targets = np.empty((len(vectors), self.target_size))
-        self._c.build_targets(len(vectors), pointer(vectors), pointer(targets))
+        self.library.build_targets(len(vectors), pointer(vectors), pointer(targets))
         return targets
 
     @cached_property
@@ -239,28 +239,9 @@ class ChartKernel:
         """From which searches start."""
         return ChartPostures.build(self.maps, self.charts, RULES.postures)
 
-    @property
-    def track(self) -> Any:
-        """`arm_track` of the library."""
-        return self._c.arm_track
-
-    @property
-    def track_value(self) -> Any:
-        """The same for x as the task's vector."""
-        return self._c.track_value
-
-    @property
-    def reset(self) -> Any:
-        """`arm_track_reset` of the library."""
-        return self._c.arm_track_reset
-
-    @property
-    def hold(self) -> Any:
-        """`arm_track_hold` of the library."""
-        return self._c.arm_track_hold
-
     @cached_property
-    def _c(self) -> Any:
+    def library(self) -> Any:
+        """The compiled library; trackers call `arm_track`, `track_value`, and `arm_track_reset` and `_hold`."""
         sources = write_tracker(self.maps, self.charts, "arm", "arm_rows.c")
         if self.charts and self.maps.robot.n - self.maps.task.m == 1:
             sources |= write_curves(self.maps.equations, *self._limits)

@@ -46,18 +46,12 @@ def certificate_to_data(certificate: Certificate) -> tuple[dict[str, Any], dict[
         tree: Subdivision | None = getattr(certificate, name)
         if tree is not None:
             arrays |= {f"certificate_{name}_{corner}": getattr(tree, corner) for corner in _CORNERS}
-    header = {
-        "fingerprint": certificate.fingerprint,
-        "method": certificate.method,
-        "bound": certificate.bound,
-        "conditioning": certificate.conditioning,
-        "fold": [list(point) for point in certificate.fold],
-        "boxes": certificate.boxes,
-        "seconds": certificate.seconds,
-        **({"least_singular_value": certificate.least_singular_value} if certificate.least_singular_value else {}),
-        **({name: getattr(certificate, name) for name in _GUARDED} if certificate.least_volume else {}),
-        **({"digest": certificate.digest} if certificate.digest else {}),
-    }
+    names = ["fingerprint", "method", "bound", "conditioning", "fold", "boxes", "seconds"]
+    names += ["least_singular_value"] if certificate.least_singular_value else []
+    names += _GUARDED if certificate.least_volume else ()
+    names += ["digest"] if certificate.digest else []
+    header: dict[str, Any] = {name: getattr(certificate, name) for name in names}
+    header["fold"] = [list(point) for point in certificate.fold]
     return header, arrays
 
 
@@ -84,10 +78,8 @@ def certificate_from_data(data: Mapping[str, Any], arrays: Mapping[str, Stored],
         tuple(tuple(float(value) for value in point) for point in fold),
         require_count("boxes of a certificate", int(_number(data, "boxes")), least=0),
         _number(data, "seconds"),
-        _number(data, "least_singular_value") if "least_singular_value" in data else 0.0,
-        _number(data, "least_volume") if "least_volume" in data else 0.0,
-        _number(data, "clear_share") if "clear_share" in data else 0.0,
-        get_part(data, "digest", str) if "digest" in data else "",  # missing in older files
+        *(_number(data, name) if name in data else 0.0 for name in ("least_singular_value", *_GUARDED)),
+        get_part(data, "digest", str) if "digest" in data else "",
     )
     # older files count boxes that were given up
     if "dead" not in data:

@@ -7,9 +7,8 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocas.charts.curve_tracer import RULES, CurveTracer, Traces, solutions_of
+from orthocas.charts.curve_tracer import RULES, CurveTracer, SearchKernel, Traces, has_library, solutions_of
 from orthocas.charts.descent import BoxedPhi
-from orthocas.charts.motion_kernel import SearchKernel, has_library
 from orthocas.charts.newton import Starts, largest
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, Indices

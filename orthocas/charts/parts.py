@@ -10,12 +10,11 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.charts.coordinates import Coordinates, InvertibleMap, fill_coordinates
-from orthocas.charts.curve_tracer import CurveTracer
+from orthocas.charts.curve_tracer import CurveTracer, MotionKernel, SearchKernel, has_library
 from orthocas.charts.curves import SelfMotionCurves
 from orthocas.charts.descent import RULES, BoxedPhi, InDomain
 from orthocas.charts.inside import Inside
 from orthocas.charts.inverse import Inverse
-from orthocas.charts.motion_kernel import MotionKernel, SearchKernel, has_library
 from orthocas.charts.newton import (
     NEWTON,
     Continuation,

@@ -11,8 +11,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
-from orthocas.charts.curve_tracer import solutions_of
-from orthocas.charts.motion_kernel import ENDLESS, FOLD, SINGULAR, WALL
+from orthocas.charts.curve_tracer import ENDLESS, FOLD, SINGULAR, WALL, solutions_of
 from orthocas.charts.newton import Newton, largest
 from orthocas.charts.walls import Stop, Walls
 from orthocas.errors import InvalidValueError, degrees_hint
@@ -228,12 +227,13 @@ def branch_along(
 
         return LevelCurve(chart, held, spacing, collisions).follow(q, gradient, rise if folds else None)
     # Which boundary stops the way is asked just beyond it.
-    if way.stop == WALL:
+    points, xi, length, end, beyond = way
+    if end == WALL:
         walls = Walls(chart.problem)
-        stop = walls.stop(int(np.argmin(walls.values(way.beyond))), way.q[-1])
+        stop = walls.stop(int(np.argmin(walls.values(beyond))), points[-1])
     else:
-        stop = Stop({ENDLESS: StopKind.ENDLESS, SINGULAR: StopKind.SINGULAR, FOLD: StopKind.FOLD}[way.stop])
-    return Branch(way.q, way.length, stop, way.xi[:, None])
+        stop = Stop({ENDLESS: StopKind.ENDLESS, SINGULAR: StopKind.SINGULAR, FOLD: StopKind.FOLD}[end])
+    return Branch(points, length, stop, xi[:, None])
 
 
 def counted_on(rows: Array, turns: Array) -> Array:
