@@ -81,13 +81,9 @@ class Chart(Shown):
         require_kind("notes", self.notes, Mapping)
         object.__setattr__(self, "notes", MappingProxyType(dict(self.notes)))
         if self.certificate is not None:
-            self._check_certificate(self.certificate)
+            from orthocas.charts.chart_file import fingerprint  # all that files may hold, which a fit does not need
 
-    def _check_certificate(self, certificate: Certificate) -> None:
-        """Raise CertifyError for a proof of another chart."""
-        from orthocas.charts.chart_file import fingerprint  # all that files may hold, which a fit does not need
-
-        certificate.require_for(fingerprint(self.problem, self.coordinates))
+            self.certificate.require_for(fingerprint(self.problem, self.coordinates))
 
     def __reduce__(self) -> tuple[type[Self], tuple[Any, ...]]:
         """Pickle and copy the fields, with the notes as a plain dict: a read-only mapping supports neither."""

@@ -85,7 +85,15 @@ def point_functions(family: Family, theta: Array, n: int) -> dict[str, ca.Functi
     if isinstance(family, SelfDerivativeFamily):
         return _from_tables(family, theta, n)
     if isinstance(family, LinearFamily):
-        return _from_basis(family, theta, n)
+        # xi = C psi, J = C dpsi/dq and C d^2 psi[v, w], with the coefficients C and the basis psi
+        x, a, b = (ca.SX.sym(name, n) for name in ("q", "v", "w"))
+        psi = family.basis(x)
+        basis = ca.Function("basis", [x], [psi])
+        slopes = ca.Function("basis_slopes", [x], [ca.densify(ca.jacobian(psi, x))])
+        bends = ca.Function("basis_bends", [x, a, b], [ca.densify(second_derivative(psi, x, a, b))])
+        C = ca.MX(ca.DM(theta.reshape(family.outputs, family.width)))
+        q, v, w = (ca.MX.sym(name, n) for name in ("q", "v", "w"))
+        return _functions(C @ basis(q), C @ slopes(q), C @ bends(q, v, w), q, v, w)
     kind: Any = ca.MX if family.as_matrices else ca.SX
     q, v, w = (kind.sym(name, n) for name in ("q", "v", "w"))
     # constants, so that weights are not sliced and transposed at every call
@@ -98,18 +106,6 @@ def point_functions(family: Family, theta: Array, n: int) -> dict[str, ca.Functi
 def second_derivative(values: Any, q: Any, v: Any, w: Any) -> Any:
     """(d/ds) J(q + s v) w of an SX or MX expression."""
     return ca.jtimes(ca.jtimes(values, q, w), q, v)
-
-
-def _from_basis(family: LinearFamily, theta: Array, n: int) -> dict[str, ca.Function]:
-    """xi = C psi, J = C dpsi/dq and C d^2 psi[v, w], with the coefficients C and the basis psi."""
-    x, a, b = (ca.SX.sym(name, n) for name in ("q", "v", "w"))
-    psi = family.basis(x)
-    basis = ca.Function("basis", [x], [psi])
-    slopes = ca.Function("basis_slopes", [x], [ca.densify(ca.jacobian(psi, x))])
-    bends = ca.Function("basis_bends", [x, a, b], [ca.densify(second_derivative(psi, x, a, b))])
-    C = ca.MX(ca.DM(theta.reshape(family.outputs, family.width)))
-    q, v, w = (ca.MX.sym(name, n) for name in ("q", "v", "w"))
-    return _functions(C @ basis(q), C @ slopes(q), C @ bends(q, v, w), q, v, w)
 
 
 def _from_tables(family: SelfDerivativeFamily, theta: Array, n: int) -> dict[str, ca.Function]:

@@ -184,7 +184,12 @@ class SelfMotionCurves:
             xi_left = self._take_crossed(targets, steps, tolerance, best)
             more = best.distance[steps.row] > 0
             arcs = self._arcs(targets, steps.part(more), xi_left[more])
-            self._take_roots(targets, arcs, tolerance, best)
+            near = (arcs.inside[:, :-1] | arcs.inside[:, 1:] | arcs.passing) & (best.distance[arcs.row, None] > 0)
+            arc, place = np.nonzero(near)
+            crossed, share = self._crossed(np.stack([arcs.xi_left[arc, place], arcs.xi_left[arc, place + 1]], axis=1))
+            arc, place, share = arc[crossed], place[crossed], share[:, None]
+            guess = (1 - share) * arcs.q[arc, place] + share * arcs.q[arc, place + 1]
+            self._take_solutions(targets, arcs.row[arc], guess, tolerance, best)
             ends = ends.joined(self._take_points(targets, arcs, best))
             # other starts on these curves are done, too
             on = np.flatnonzero((best.distance[traces.row] > 0) & ~known[of].all(axis=1))
@@ -331,16 +336,6 @@ class SelfMotionCurves:
             found.append(np.column_stack([curve, first[curve, place] + np.array(extra)]))
         sheets = np.unique(np.concatenate(found), axis=0)
         return sheets[:, 0].astype(np.int64), turn * sheets[:, 1:]
-
-    def _take_roots(self, targets: Array, arcs: "Arcs", tolerance: float, best: Nearest) -> None:
-        """Solutions of phi(q) = phi on arcs."""
-        near = arcs.inside[:, :-1] | arcs.inside[:, 1:] | arcs.passing
-        near &= best.distance[arcs.row, None] > 0
-        arc, place = np.nonzero(near)
-        crossed, share = self._crossed(np.stack([arcs.xi_left[arc, place], arcs.xi_left[arc, place + 1]], axis=1))
-        arc, place, share = arc[crossed], place[crossed], share[:, None]
-        q = (1 - share) * arcs.q[arc, place] + share * arcs.q[arc, place + 1]
-        self._take_solutions(targets, arcs.row[arc], q, tolerance, best)
 
     def _take_solutions(self, targets: Array, rows: Indices, q: Array, tolerance: float, best: Nearest) -> None:
         """Solutions of phi(q) = phi inside to which Newton's steps lead from points q (K, n) of some rows."""

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -90,7 +90,14 @@ def sample_path(name: str, path: Any, size: int, labels: tuple[str, ...]) -> Arr
         InvalidValueError, ShapeError: for anything else. The message names the first bad entry.
     """
     if callable(path):
-        return np.array([_evaluate_function(name, path, s, size) for s in np.linspace(0, 1, RULES.samples)])
+        rows = []
+        for s in np.linspace(0, 1, RULES.samples).tolist():
+            try:
+                value = path(s)
+            except Exception as error:
+                raise InvalidValueError(f"{name}({s:g})", f"{type(error).__name__}: {error}", "a value") from None
+            rows.append(freeze_array(f"{name}({s:g})", value, (size,)))
+        return np.array(rows)
     points = as_float_array(name, path)
     if points.ndim != 2 or points.shape[1] != size:
         raise ShapeError(f"{name} ({', '.join(labels)})", points.shape, (None, size))
@@ -190,14 +197,6 @@ def build_spline(s: Array, points: Array, closed: bool) -> CubicSpline:
     if closed:
         points = np.vstack([points[:-1], points[:1]])
     return CubicSpline(s, points, bc_type="periodic" if closed else "not-a-knot")
-
-
-def _evaluate_function(name: str, function: Callable[[float], Any], s: float, size: int) -> Array:
-    try:
-        value = function(float(s))
-    except Exception as error:
-        raise InvalidValueError(f"{name}({s:g})", f"{type(error).__name__}: {error}", "a value") from None
-    return freeze_array(f"{name}({s:g})", value, (size,))
 
 
 @dataclass(frozen=True, eq=False)
