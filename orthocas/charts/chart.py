@@ -81,9 +81,13 @@ class Chart(Shown):
         require_kind("notes", self.notes, Mapping)
         object.__setattr__(self, "notes", MappingProxyType(dict(self.notes)))
         if self.certificate is not None:
-            from orthocas.charts.chart_file import fingerprint  # all that files may hold, which a fit does not need
+            self._check_certificate(self.certificate)
 
-            self.certificate.require_for(fingerprint(self.problem, self.coordinates))
+    def _check_certificate(self, certificate: Certificate) -> None:
+        """Raise CertifyError for a proof of another chart."""
+        from orthocas.charts.chart_file import fingerprint  # all that files may hold, which a fit does not need
+
+        certificate.require_for(fingerprint(self.problem, self.coordinates))
 
     def __reduce__(self) -> tuple[type[Self], tuple[Any, ...]]:
         """Pickle and copy the fields, with the notes as a plain dict: a read-only mapping supports neither."""
@@ -105,17 +109,17 @@ class Chart(Shown):
         """Where the chart is meant to be used."""
         return self.problem.domain
 
-    @property
+    @cached_property
     def n(self) -> int:
         """Number of joints."""
         return self.problem.n
 
-    @property
+    @cached_property
     def m(self) -> int:
         """Number of task components."""
         return self.problem.m
 
-    @property
+    @cached_property
     def r(self) -> int:
         """Number of extra coordinates."""
         return self.problem.r
@@ -269,7 +273,8 @@ class Chart(Shown):
             ours: docs/how-to/inverse.md.
         """
         phi = build_phi(self, phi, x, xi)
-        require_collisions(collisions, self.problem.robot.tree)
+        if collisions is not None:
+            require_collisions(collisions, self.problem.robot.tree)
         require_kind("all", all, bool)
         # all solutions of one phi
         if all:

@@ -228,7 +228,7 @@ def solve_all(chart: Chart, phi: Array, tolerance: float, collisions: Collisions
     assert whole is not None
     # what Newton's method finds from stored points, then all of the domain
     starts = search.starts.nearest(phi[None], RULES.first, chart.n)[:, 0]
-    near = (search.brief or search.local)(np.broadcast_to(phi, starts.shape), starts)
+    near = search.brief(np.broadcast_to(phi, starts.shape), starts)
     solved = near.q[largest(near.residual) <= tolerance]
     every = np.concatenate([solved[domain.contains(solved)], whole.find_all(phi, near.q, float(tolerance))])
     # where full turns change xi, solutions have no end: those within one and a half turns of the centre
@@ -377,12 +377,12 @@ class Inverse:
     problem: Problem
     phi_map: PhiMap
     local: LocalSolver
+    brief: LocalSolver  #: in place of `local` where another search follows anyway; it may give up early
     starts: Starts
     along: Continuation | None = None  #: follows lines of values from given starts; for fitted coordinates
     in_domain: InDomain | None = None  #: searches all of the domain; for fitted coordinates with r > 1
     inside: Inside | None = None  #: finds points inside that keep the task; for fitted coordinates
     curves: SelfMotionCurves | None = None  #: finds the nearest xi at a task value; for fitted coordinates with r = 1
-    brief: LocalSolver | None = None  #: in place of `local` where curves are searched anyway; it may give up early
 
     def solve(self, targets: Array, starts: Array | None, tolerance: float, inside: bool) -> Solutions:
         """Solutions for targets (N, n), from starts (N, n) or our own. Rows that are not finite fail."""
@@ -399,27 +399,27 @@ class Inverse:
                     some, self._search(targets[some], None if starts is None else starts[some], tolerance, inside)
                 )
         # |xi(q) - xi|: infinite where xi(q) is undefined
-        error, of_xi = found.error, (found.residual * self.phi_map.scale(targets))[:, self.problem.m :]
+        error, of_xi = found.error, (found.residual * self.phi_map.scale(targets))[:, self._m :]
         distance = np.sqrt((of_xi**2).sum(axis=1))
         distance[~np.isfinite(distance)] = np.inf
         error[~good] = distance[~good] = np.nan
         if inside:
             kept = np.isin(found.status, (InverseStatus.NEAREST, InverseStatus.OUTSIDE_DOMAIN))
-            error[kept] = largest(found.residual[kept, : self.problem.m])
+            error[kept] = largest(found.residual[kept, : self._m])
         return Solutions(found.q, found.status, found.iterations, error, distance, tolerance)
 
     def _search(self, targets: Array, starts: Array | None, tolerance: float, inside: bool) -> Found:
         """What the search finds from given starts, or from the rough inverse and, where that fails, in the domain."""
         # Where a longer search follows in any case, as with `inside`, so that both begin it at the same places.
         follows = inside or (starts is None and (self.curves is not None or not self.problem.domain.is_box))
-        first = self.local if self.brief is None or not follows else self.brief
+        first = self.brief if follows else self.local
         best = self._attempt(targets, self.starts.guess(targets) if starts is None else starts, tolerance, first)
         # most rows end here
         if not best.status.any():
             return best
         # rows without a solution, because the arm is too short
         rows = np.flatnonzero(best.status == InverseStatus.NOT_FOUND)
-        beyond = beyond_reach(self.problem.task, targets[rows, : self.problem.m])
+        beyond = beyond_reach(self.problem.task, targets[rows, : self._m])
         best.status[rows[beyond]] = InverseStatus.OUT_OF_REACH
         if inside and self.inside is not None:
             own = best.q.copy() if starts is None else starts
@@ -527,7 +527,7 @@ class Inverse:
         rows, q = rows[moved], q[moved]
         residual = self.phi_map.residual(targets[rows], q)
         # a status claims no more than was checked: x, all of phi, the domain
-        kept, inside = largest(residual[:, : self.problem.m]) <= tolerance, self.problem.domain.contains(q)
+        kept, inside = largest(residual[:, : self._m]) <= tolerance, self.problem.domain.contains(q)
         whole = kept & (largest(residual) <= tolerance)
         best.q[rows], best.residual[rows] = q, residual
         beyond = best.status[rows] == InverseStatus.OUT_OF_REACH
@@ -565,6 +565,11 @@ class Inverse:
         if doubtful.size:
             status[doubtful[self.phi_map.is_singular(attempt.q[doubtful])]] = InverseStatus.SINGULAR
         return Found(attempt.q, attempt.residual, attempt.iterations, status)
+
+    @cached_property
+    def _m(self) -> int:
+        """Number of task components."""
+        return self.problem.m
 
     @cached_property
     def _bounds(self) -> tuple[Array, Array]:

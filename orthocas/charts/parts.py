@@ -201,14 +201,15 @@ class ChartParts:
         # grown coordinates bring their own inverse
         starts = Starts(phi_map, domain)
         if isinstance(chart.coordinates, InvertibleMap):
-            return Inverse(chart.problem, phi_map, OwnInverse(chart.coordinates, phi_map), starts)
+            own = OwnInverse(chart.coordinates, phi_map)
+            return Inverse(chart.problem, phi_map, own, own, starts)
         boxed = self.boxed
         local, brief = (
             FewRows(phi_map, self.point_functions, Newton(phi_map, k)) for k in (NEWTON.halvings, NEWTON.brief)
         )
         in_domain, inside = InDomain(boxed, starts), Inside(boxed, starts)
         curves = SelfMotionCurves(boxed, starts, self.tracer, SearchKernel(chart)) if chart.r == 1 else None
-        return Inverse(chart.problem, phi_map, local, starts, Continuation(phi_map), in_domain, inside, curves, brief)
+        return Inverse(chart.problem, phi_map, local, brief, starts, Continuation(phi_map), in_domain, inside, curves)
 
     @cached_property
     def point_functions(self) -> PointFunctions:

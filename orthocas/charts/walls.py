@@ -108,7 +108,11 @@ class Walls:
         """All functions at one joint position (n,), positive inside; infinite for unbounded joints."""
         width = self._domain.half_width
         rooms = np.array([wall.room(q) for wall in self._curved])
-        parts = [(q - self._low) / width, (self._high - q) / width, np.where(np.isfinite(rooms), rooms, -1.0)]
+        parts = [
+            (q - self._low) / width,
+            (self._high - q) / width,
+            np.where(np.isfinite(rooms) | (rooms > 0), rooms, -1.0),
+        ]
         return np.concatenate(parts)
 
     def box_has(self, q: Array) -> bool:
