@@ -185,16 +185,13 @@ class ChartKernel:
         q = np.empty((count, n))
         status, owner = (np.empty(count, dtype=np.intc) for _ in range(2))
         # Which charts may answer.
-        flags = np.zeros(len(self.charts), dtype=np.int8)
-        flags[list(allowed)] = 1
+        flags = np.isin(np.arange(len(self.charts)), allowed).astype(np.int8)
         solve, stored, whole = self.library.solve_rows, self.postures.in_c, self._range
-        # Room for the points of all curves of a target, and for distances (float) of the stored postures.
-        room_size = CURVES.nodes * (2 * n + 1) + (len(self.maps.stored.q) + 1) // 2
         inputs = [np.ascontiguousarray(part) for part in (targets, xi)]
         first = None if starts is None else np.ascontiguousarray(starts)
 
         def solve_piece(begin: int) -> None:
-            rows, room = slice(begin, begin + RULES.piece), np.empty(room_size)
+            rows, room = slice(begin, begin + RULES.piece), self._build_room()
             start = None if first is None else pointer(first[rows])
             solve(
                 *(len(q[rows]), *(pointer(part[rows]) for part in inputs), start, pointer(flags)),
@@ -215,10 +212,8 @@ class ChartKernel:
         Raises:
             InvalidValueError: if there are more than 1,000.
         """
-        flags, n = np.zeros(len(self.charts), dtype=np.int8), self.maps.robot.n
-        flags[list(allowed)] = 1
-        room = np.empty(CURVES.nodes * (2 * n + 1) + (len(self.maps.stored.q) + 1) // 2)
-        q, owner = np.empty((RULES.every, n)), np.empty(RULES.every, dtype=np.intc)
+        flags, room = np.isin(np.arange(len(self.charts)), allowed).astype(np.int8), self._build_room()
+        q, owner = np.empty((RULES.every, self.maps.robot.n)), np.empty(RULES.every, dtype=np.intc)
         count = self.library.solve_all(
             *(pointer(target), ctypes.c_double(xi), None if start is None else pointer(np.ascontiguousarray(start))),
             *(pointer(flags), ctypes.byref(self._range), CURVES.patience, pointer(room), CURVES.nodes),
@@ -227,6 +222,10 @@ class ChartKernel:
         if count > RULES.every:
             raise InvalidValueError("xi", f"{xi:g}, which more than {RULES.every} postures have", "fewer postures")
         return q[:count], owner[:count].astype(np.int64)
+
+    def _build_room(self) -> Array:
+        """Room for the points of all curves of a target, and for distances (float) of the stored postures."""
+        return np.empty(CURVES.nodes * (2 * self.maps.robot.n + 1) + (len(self.maps.stored.q) + 1) // 2)
 
     def build_targets(self, vectors: Array) -> Array:
         """As `TargetReader.build`, of contiguous vectors (N, m)."""
