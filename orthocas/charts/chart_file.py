@@ -78,7 +78,9 @@ def certificate_from_data(data: Mapping[str, Any], arrays: Mapping[str, Stored],
         tuple(tuple(float(value) for value in point) for point in fold),
         require_count("boxes of a certificate", int(_number(data, "boxes")), least=0),
         _number(data, "seconds"),
-        *(_number(data, name) if name in data else 0.0 for name in ("least_singular_value", *_GUARDED)),
+        _number(data, "least_singular_value") if "least_singular_value" in data else 0.0,
+        _number(data, "least_volume") if "least_volume" in data else 0.0,
+        _number(data, "clear_share") if "clear_share" in data else 0.0,
         get_part(data, "digest", str) if "digest" in data else "",
     )
     # older files count boxes that were given up
