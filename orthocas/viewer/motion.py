@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from orthocas.charts.chart import Chart
 from orthocas.charts.trackers import TrackerStatus
 from orthocas.errors import InvalidValueError, PathError, PathFileError
-from orthocas.paths.joint_motion import JointMotion
-from orthocas.paths.recordings import read_joints
+from orthocas.paths.joint_motion import JointMotion, read_joints
 from orthocas.robots.robot import Robot
 from orthocas.simulation.trajectory import Trajectory
 from orthocas.tools.checks import Array, as_float_array, as_point_set, freeze_array, require_count, require_kind

@@ -51,7 +51,7 @@ READERS = {  #: functions that read files, by module and name, with the campaign
     "charts.chart_file.read_chart": "charts",
     "charts.ready.load": "charts",
     "native.libraries.load_library": "libraries",
-    "paths.recordings.read_joints": "motions",
+    "paths.joint_motion.read_joints": "motions",
     "paths.tool_path.read_path": "paths",
     "tasks.corridor.read_postures": "postures",
     "robots.urdf.read_srdf_postures": "robots",
