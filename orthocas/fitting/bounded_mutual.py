@@ -8,7 +8,7 @@ from orthocas.charts.point_quality import pairs
 from orthocas.errors import InfeasibleError, InvalidValueError, SolveError
 from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, Weights
-from orthocas.solvers.gauss_newton import GaussNewton
+from orthocas.solvers.minimisers import GaussNewton
 from orthocas.solvers.protocol import SolveResult, Status
 from orthocas.tools.checks import Array
 

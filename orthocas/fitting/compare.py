@@ -29,7 +29,7 @@ from orthocas.fitting.like import Likeness
 from orthocas.fitting.settings import choose_solver
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, WeightNumbers, Weights
 from orthocas.fitting.wide import CLEARANCE, WideFit, fit_wide
-from orthocas.solvers.gauss_newton import GaussNewton
+from orthocas.solvers.minimisers import GaussNewton
 from orthocas.solvers.protocol import Solver, Status
 from orthocas.tasks.branches import Branch, branches
 from orthocas.tasks.domains import Box

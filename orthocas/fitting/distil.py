@@ -17,7 +17,7 @@ from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.quality import Report, evaluate
 from orthocas.errors import GrowError, InvalidValueError
 from orthocas.exact.flow import GrownCoordinates
-from orthocas.solvers.lbfgs import LBFGS
+from orthocas.solvers.minimisers import LBFGS
 from orthocas.solvers.protocol import Solver
 from orthocas.tasks.samples import sample_evenly, sample_uniform
 from orthocas.tools.batch import Batched, dense_function

@@ -14,8 +14,7 @@ from orthocas.charts.point_quality import in_the_metric, worst_points
 from orthocas.fitting.basis_objective import BasisObjective, build_gradients
 from orthocas.fitting.starts import find_spectral_start
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, Weights
-from orthocas.solvers.gauss_newton import GaussNewton
-from orthocas.solvers.lbfgs import QuasiNewton
+from orthocas.solvers.minimisers import GaussNewton, QuasiNewton
 from orthocas.solvers.protocol import Status
 from orthocas.tasks.domains import Box
 from orthocas.tasks.problem import (

@@ -12,8 +12,7 @@ from orthocas.fitting.like import RULES as LIKE_RULES
 from orthocas.fitting.like import Like, Likeness, LikeTerm
 from orthocas.fitting.terms import WeightNumbers, Weights, register_loss_term
 from orthocas.solvers.casadi_solvers import Ipopt
-from orthocas.solvers.gauss_newton import GaussNewton
-from orthocas.solvers.lbfgs import LBFGS, QuasiNewton
+from orthocas.solvers.minimisers import LBFGS, GaussNewton, QuasiNewton
 from orthocas.solvers.protocol import Solver
 from orthocas.tasks.problem import Problem
 from orthocas.tools.checks import as_number, require_count, require_kind, require_known

@@ -32,7 +32,7 @@ from orthocas.fitting.settings import RULES, FitSettings
 from orthocas.fitting.starts import Mirror, find_mirror, find_spectral_start
 from orthocas.fitting.terms import FOLD_TERM
 from orthocas.fitting.terms import RULES as LOSS_RULES
-from orthocas.solvers.gauss_newton import GaussNewton
+from orthocas.solvers.minimisers import GaussNewton
 from orthocas.solvers.protocol import Objective, SampledObjective, Solver, SolveResult, Status
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.samples import Samples, evaluate_samples, sample_evenly, sample_problem

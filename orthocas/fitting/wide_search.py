@@ -18,8 +18,7 @@ from orthocas.fitting.stages import Resampled, Stage, WeightedSum
 from orthocas.fitting.terms import RULES as LOSS
 from orthocas.fitting.terms import Weights, find_least_volume
 from orthocas.robots.collisions import Collisions
-from orthocas.solvers.adam import Adam
-from orthocas.solvers.lbfgs import LBFGS
+from orthocas.solvers.minimisers import LBFGS, Adam
 from orthocas.solvers.protocol import Objective, Solver, SolveResult
 from orthocas.tasks.domains import Box
 from orthocas.tasks.problem import Problem
