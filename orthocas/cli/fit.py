@@ -9,8 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from orthocas.bases.family import Parametrisation
-from orthocas.bases.registry import parse_parametrisation
+from orthocas.bases.family import Parametrisation, parse_parametrisation
 from orthocas.charts.chart_file import CHART
 from orthocas.charts.quality import Report, evaluate
 from orthocas.cli.options import (

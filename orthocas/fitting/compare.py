@@ -17,8 +17,7 @@ from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any, cast
 
-from orthocas.bases.family import Parametrisation
-from orthocas.bases.registry import parametrisation_to_data, parse_parametrisation
+from orthocas.bases.family import Parametrisation, parametrisation_to_data, parse_parametrisation
 from orthocas.charts.chart_file import CHART
 from orthocas.charts.quality import evaluate
 from orthocas.charts.ready import load

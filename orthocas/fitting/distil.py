@@ -9,7 +9,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from orthocas.bases.circle import CircleFamily
+from orthocas.bases.composed import CircleFamily
 from orthocas.bases.family import Family, JointSpace, LinearFamily, Parametrisation
 from orthocas.bases.products import Polynomial
 from orthocas.charts.chart import Chart

@@ -11,10 +11,15 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from orthocas.bases.circle import CircleFamily
-from orthocas.bases.cyclic import Mobile, anywhere, widen_over_cyclic_joints
-from orthocas.bases.family import CyclicParametrisation, JointSpace, Parametrisation, ReorderableFamily
-from orthocas.bases.registry import warn_unless_savable
+from orthocas.bases.composed import CircleFamily, Mobile
+from orthocas.bases.cyclic import anywhere, widen_over_cyclic_joints
+from orthocas.bases.family import (
+    CyclicParametrisation,
+    JointSpace,
+    Parametrisation,
+    ReorderableFamily,
+    warn_unless_savable,
+)
 from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.point_quality import WorstPoints
@@ -171,7 +176,7 @@ def _fit(
     # the domain that the family asks for, and whether the task can be regular there
     parametrisation = settings.parametrisation
     warn_unless_savable(parametrisation)
-    if isinstance(parametrisation, CyclicParametrisation):
+    if isinstance(parametrisation, CyclicParametrisation) and parametrisation.cyclic:
         problem = widen_over_cyclic_joints(problem, tuple(parametrisation.cyclic))
     if problem.robot.tree.floating and (parametrisation.closed_form is not None or not settings.split_idle):
         expected = "one to fit in the arms' joints, such as Polynomial(1), with split_idle: the base floats"

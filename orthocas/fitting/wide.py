@@ -18,10 +18,10 @@ from orthocas.bases.family import (
     LinearFamily,
     Parametrisation,
     require_parametrisation,
+    warn_unless_savable,
 )
 from orthocas.bases.mlp import MLP
 from orthocas.bases.products import Polynomial
-from orthocas.bases.registry import warn_unless_savable
 from orthocas.charts.chart import Chart
 from orthocas.charts.chart_file import FREE
 from orthocas.charts.coordinates import Coordinates
