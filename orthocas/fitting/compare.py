@@ -25,7 +25,7 @@ from orthocas.codegen.library import control_tick
 from orthocas.errors import ChartFileError, Interrupted, InvalidValueError, OrthocasError
 from orthocas.fitting.fit import Fit, fit
 from orthocas.fitting.like import Likeness
-from orthocas.fitting.settings import choose_solver
+from orthocas.fitting.stages import choose_solver
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, WeightNumbers, Weights
 from orthocas.fitting.wide import CLEARANCE, WideFit, fit_wide
 from orthocas.solvers.minimisers import GaussNewton

@@ -26,8 +26,7 @@ from orthocas.charts.point_quality import WorstPoints
 from orthocas.charts.quality import evaluate
 from orthocas.errors import DomainError, Interrupted, InvalidValueError, OrthocasError
 from orthocas.fitting.like import Likeness
-from orthocas.fitting.settings import RULES, FitSettings, Precision
-from orthocas.fitting.stages import Begin, Continuation, FoldSearch, Solution, Stage, StageRunner
+from orthocas.fitting.stages import RULES, Begin, Continuation, FitSettings, FoldSearch, Precision, Solution, Stage
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, WeightNumbers, Weights
 from orthocas.robots.robot import Robot
 from orthocas.solvers.protocol import Solver, Status
@@ -242,8 +241,7 @@ def _solve(
     like = None if settings.like is None else settings.like.build_term(problem, active)
     settings = settings if like is None else settings.add_term(like)
     folds = FoldSearch(problem, active, settings.fold_weight(problem), singular)
-    runner = StageRunner(problem, settings, active, monitor, folds, like)
-    solution = Continuation(runner, r, begin).run()
+    solution = Continuation(problem, settings, active, monitor, folds, like, begin).run()
     # angles leave free where xi is zero, how long its gradient is, the order and the signs
     raw = Coordinates(solution.parametrisation, space, idle, solution.theta, np.zeros(r), np.ones(r))
     coordinates = normalise(raw, problem.domain.home, samples)

@@ -16,7 +16,7 @@ from orthocas.charts.point_quality import worst_points
 from orthocas.errors import DomainError, InvalidValueError, MetricError
 from orthocas.fitting.fit import Fit, fit_from
 from orthocas.fitting.probe import RULES, Bounds, Miss, Prober, Quality, describe_conditioning, evaluate_chart
-from orthocas.fitting.settings import choose_parametrisation
+from orthocas.fitting.stages import choose_parametrisation
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, WeightNumbers, Weights
 from orthocas.robots.robot import Robot
 from orthocas.robots.tree import PRISMATIC_ROOM, REVOLUTE_ROOM, require_driven

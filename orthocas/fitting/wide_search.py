@@ -12,9 +12,10 @@ from orthocas.bases.mlp import MLP
 from orthocas.charts.coordinates import Coordinates
 from orthocas.errors import InvalidValueError
 from orthocas.fitting.basis_objective import BasisGradients, BasisObjective, build_gradients
+from orthocas.fitting.combined import Resampled, WeightedSum
 from orthocas.fitting.like import Like, QuadraticTerm
 from orthocas.fitting.network_objective import ArrayObjective, GraphObjective
-from orthocas.fitting.stages import Resampled, Stage, WeightedSum
+from orthocas.fitting.stages import Stage
 from orthocas.fitting.terms import RULES as LOSS
 from orthocas.fitting.terms import Weights, find_least_volume
 from orthocas.robots.collisions import Collisions
