@@ -187,8 +187,12 @@ def _fit(
         samples = sample_problem(problem, RULES.first, (settings.seed, RULES.first_tag))
         # closed forms need no minimisation; others run the stages of `orthocas.fitting.stages`
         if parametrisation.closed_form is not None:
-            solution = Solution((), parametrisation, None)
-            coordinates = _evaluate_closed_form(problem, parametrisation, samples)
+            values, solution = parametrisation.closed_form(problem), Solution((), parametrisation, None)
+            r, space = problem.r, JointSpace.of(problem)
+            raw = Coordinates(parametrisation, space, (), values.theta, np.zeros(r), np.ones(r))
+            origin = problem.domain.home if values.origin is None else values.origin
+            coordinates = normalise(raw, origin, samples)
+            coordinates = coordinates if values.scaled else replace(coordinates, scale=np.ones(r))
         else:
             singular = problem_check.singular_samples > 0
             solution, coordinates = _solve(problem, settings, monitor, samples, align_to, begin, singular)
@@ -207,17 +211,6 @@ def _fit(
         if result.status is Status.INTERRUPTED or pressed():
             raise Interrupted(result)
     return result
-
-
-def _evaluate_closed_form(problem: Problem, parametrisation: Parametrisation, samples: Samples) -> Coordinates:
-    """Coordinates in closed form, which need no minimisation; see `orthocas.bases.ClosedForm`."""
-    assert parametrisation.closed_form is not None
-    values = parametrisation.closed_form(problem)
-    r = problem.r
-    raw = Coordinates(parametrisation, JointSpace.of(problem), (), values.theta, np.zeros(r), np.ones(r))
-    origin = problem.domain.home if values.origin is None else values.origin
-    scaled = normalise(raw, origin, samples)
-    return scaled if values.scaled else replace(scaled, scale=np.ones(r))
 
 
 def _solve(

@@ -225,8 +225,11 @@ class Search:
             self._sign = 1.0 if self._evaluate_volumes(self._last, self._centre)[0] > 0 else -1.0
             self._descend(name, "volume", self.solver)
         else:
-            self._samples = [sample_frames(self.problem, np.vstack([points, self._sample_near_centre()]))]
-            problem = self.problem
+            # samples near the centre, whose sign decides which part of the domain is kept
+            problem, domain, count = self.problem, self.problem.domain, max(2, int(RULES.near * self.samples))
+            seed = self.settings.seed, RULES.tag, RULES.centre_tag
+            near = sample_uniform(Box(domain.home, RULES.near * domain.half_width), count, seed)
+            self._samples = [sample_frames(problem, np.vstack([points, near[domain.contains(near)]]))]
             if problem.metric.is_identity or problem.r > 1 or self.left_out:
                 self._last = self._start_at_random()
             else:
@@ -302,13 +305,6 @@ class Search:
             if not len(points):
                 raise InvalidValueError("collisions", "a contact at all samples of the branch", "free postures")
         return points
-
-    def _sample_near_centre(self) -> Array:
-        """Nonsingular samples near the centre of the domain, whose sign decides which part of it is kept."""
-        domain = self.problem.domain
-        near, count = Box(domain.home, RULES.near * domain.half_width), max(2, int(RULES.near * self.samples))
-        points = sample_uniform(near, count, (self.settings.seed, RULES.tag, RULES.centre_tag))
-        return np.asarray(points[domain.contains(points)])
 
     def _start_linear(self) -> Array:
         """The functions nearest to a^T q, with orthonormal a across the task at the centre, (size,).
