@@ -369,17 +369,13 @@ class Adam:
                 if not np.isfinite(gradient).all():
                     return Status.STALLED
                 rate = self.learning_rate * 0.5 * (1 + np.cos(np.pi * k / (self.epochs * self.steps)))
-                _step_adam(theta, mean, square, gradient, rate, k)
+                # in parts that stay in the cache
+                for start in range(0, len(gradient), RULES.part):
+                    own = slice(start, start + RULES.part)
+                    mean[own] += (1 - RULES.moment) * (gradient[own] - mean[own])
+                    square[own] += (1 - RULES.square) * (gradient[own] ** 2 - square[own])
+                    unbiased = np.sqrt(square[own] / (1 - RULES.square ** (k + 1))) + RULES.small
+                    theta[own] -= rate / (1 - RULES.moment ** (k + 1)) * mean[own] / unbiased
             best.evaluate(theta)
             best.next_iteration(self.epochs)
         return Status.ITERATION_LIMIT
-
-
-def _step_adam(theta: Array, mean: Array, square: Array, gradient: Array, rate: float, k: int) -> None:
-    """Take step k = 0, 1, ... in place, in parts that stay in the cache."""
-    for start in range(0, len(gradient), RULES.part):
-        part = slice(start, start + RULES.part)
-        mean[part] += (1 - RULES.moment) * (gradient[part] - mean[part])
-        square[part] += (1 - RULES.square) * (gradient[part] ** 2 - square[part])
-        unbiased = np.sqrt(square[part] / (1 - RULES.square ** (k + 1))) + RULES.small
-        theta[part] -= rate / (1 - RULES.moment ** (k + 1)) * mean[part] / unbiased

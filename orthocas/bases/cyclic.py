@@ -182,7 +182,13 @@ def keeps_self_motions(problem: Problem, joint: int) -> bool:
         return False
     # By the kinematics, h(q + t e_k) = g_t(h(q)).
     kind = task.recipe["kind"]
-    turned = TipTurn.from_kind(kind) is not None or _is_turn_of_components(tree, joint, kind)
+    turned = TipTurn.from_kind(kind) is not None
+    # Rotations about its axis map the position to itself, and two components of it if the third is along the axis.
+    name, _, axes = ("position:xy" if kind == "polar" else kind).partition(":")
+    if name == "position" and not tree.prismatic[joint]:
+        left_out = [k for k, axis in enumerate(_AXES) if axis not in axes]
+        across = len(left_out) == 1 and _is_axis(_fit_rotation(tree, joint, -1)[:, 2], left_out[0])
+        turned = not left_out or across
     if turns_tool(task, joint) or (task.of_tip and at_rest and turned):
         return True
     # By the steps of h, J_x does not depend on the joint.
@@ -198,15 +204,6 @@ def turns_tool(task: Task, joint: int) -> bool:
     turn, tree = TipTurn.from_kind(task.recipe["kind"]), task.robot.tree
     whole = task.of_tip and turn is not None and turn.whole
     return whole and joint == tree.tip_parent and joint not in tree.mimic_leaders
-
-
-def _is_turn_of_components(tree: KinematicTree, joint: int, kind: str) -> bool:
-    """Whether rotations about the axis of a joint map the position, or two components of it, to themselves."""
-    name, _, axes = ("position:xy" if kind == "polar" else kind).partition(":")
-    left_out = [k for k, axis in enumerate(_AXES) if axis not in axes]
-    if name != "position" or tree.prismatic[joint]:
-        return False
-    return not left_out or (len(left_out) == 1 and _is_axis(_fit_rotation(tree, joint, -1)[:, 2], left_out[0]))
 
 
 def _fit_rotation(tree: KinematicTree, joint: int, base: int) -> Array:

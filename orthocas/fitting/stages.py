@@ -277,9 +277,18 @@ class Continuation:
     ) -> tuple[BasisObjective, Array]:
         """The loss of a family that is linear in its parameters, and the start in those that a mirror leaves free."""
         kept = None if mirror is None else mirror.kept(family)
+        key = family, len(samples), kept is not None
+        if theta is None and key not in self._starts:
+            # it does not depend on the seed: eigenvalues are close, so other samples would mix coordinates
+            even = self._sample(len(samples), RULES.start_seed)
+            start = find_spectral_start(family, even, kept, self._gradients(family))
+            # quantities to follow choose among coordinates of equal loss
+            if self.like is not None:
+                start = self.like.turn(family, start, even, self._gradients(family))
+            self._starts[key] = start
         # the start as components, which a mirror leaves even or odd, and of these the free ones
         if theta is None:
-            theta = self._start_spectral(family, len(samples), kept)
+            theta = self._starts[key]
         elif mirror is not None:
             theta = mirror.components(theta)
         theta = theta if kept is None else theta.reshape(kept.shape)[kept]
@@ -288,18 +297,6 @@ class Continuation:
             family, samples, self.settings.weights, theta, self._draw, kept, exchanged, self._gradients(family)
         )
         return objective, theta
-
-    def _start_spectral(self, family: LinearFamily, count: int, kept: NDArray[np.bool_] | None) -> Array:
-        """A start that does not depend on the seed: eigenvalues are close, so other samples would mix coordinates."""
-        key = family, count, kept is not None
-        if key not in self._starts:
-            samples = self._sample(count, RULES.start_seed)
-            start = find_spectral_start(family, samples, kept, self._gradients(family))
-            # quantities to follow choose among coordinates of equal loss
-            if self.like is not None:
-                start = self.like.turn(family, start, samples, self._gradients(family))
-            self._starts[key] = start
-        return self._starts[key]
 
     def _family(self, parametrisation: Parametrisation) -> Family:
         """The family on the active joints: the same object every time, so that what it needs is built once."""
