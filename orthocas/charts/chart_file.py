@@ -9,10 +9,9 @@ from typing import Any
 import numpy as np
 
 from orthocas.bases.cyclic import require_cyclic
-from orthocas.bases.family import CyclicParametrisation, JointSpace
+from orthocas.bases.family import CyclicParametrisation, JointSpace, parametrisation_from_data, parametrisation_to_data
 from orthocas.bases.mlp import MLP
 from orthocas.bases.products import Fourier, Linear, Polynomial
-from orthocas.bases.registry import parametrisation_from_data, parametrisation_to_data
 from orthocas.charts.certificate import Certificate, Subdivision
 from orthocas.charts.coordinates import CoordinateMap, Coordinates
 from orthocas.charts.regular_part import RegularPart

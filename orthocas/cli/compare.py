@@ -6,8 +6,8 @@ from typing import Annotated
 import typer
 
 from orthocas import problems
+from orthocas.bases.family import parse_parametrisation
 from orthocas.bases.products import Polynomial
-from orthocas.bases.registry import parse_parametrisation
 from orthocas.charts.figures import quality_figure, self_motion_figure
 from orthocas.charts.quality import evaluate
 from orthocas.charts.ready import load

@@ -9,8 +9,7 @@ from typing import Annotated, Any
 
 import typer
 
-from orthocas.bases.family import Parametrisation
-from orthocas.bases.registry import parse_parametrisation
+from orthocas.bases.family import Parametrisation, parse_parametrisation
 from orthocas.charts.chart_file import CHART
 from orthocas.charts.quality import Report, evaluate
 from orthocas.cli.options import (
@@ -42,7 +41,7 @@ from orthocas.control.gains import find_holding_doubts
 from orthocas.errors import BranchWarning, Interrupted, InvalidValueError, OptionError
 from orthocas.fitting.fit import Fit
 from orthocas.fitting.fit import fit as fit_chart
-from orthocas.fitting.settings import choose_parametrisation
+from orthocas.fitting.stages import choose_parametrisation
 from orthocas.fitting.suggest_domain import CONDITIONING, LEAK_DEG, DomainSuggestion, suggest_domain
 from orthocas.fitting.terms import Weights
 from orthocas.fitting.wide import CLEARANCE, WideFit, fit_wide

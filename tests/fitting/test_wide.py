@@ -39,10 +39,10 @@ from orthocas.errors import (
 )
 from orthocas.fitting import wide as wide_fits
 from orthocas.fitting.basis_objective import BasisObjective, build_gradients
+from orthocas.fitting.combined import Resampled
 from orthocas.fitting.like import Like, QuadraticTerm
 from orthocas.fitting.network_objective import ArrayObjective
 from orthocas.fitting.sample_loss import Loss, build_sample_loss
-from orthocas.fitting.stages import Resampled
 from orthocas.fitting.terms import Sizes
 from orthocas.fitting.wide import WideFit, _build_problems, _describe_left_out, _fit_most
 from orthocas.fitting.wide_search import Search, WideSettings, sample_frames, search_families
