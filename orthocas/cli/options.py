@@ -163,12 +163,11 @@ class ProblemOptions:
         if is_robot_file(name):
             robot = self.build_robot(name)
             task = Task.named(robot, self.task or "position")
-            centre, half_width, domain = self.find_centre(robot), self.parse_half_width(), None
+            centre, half_width, box = self.find_centre(robot), self.parse_half_width(), None
             if centre is not None or half_width is not None:
                 centre = regular_box(robot, task).centre if centre is None else centre
-                domain = default_box(robot, centre, half_width)
-            metric = self.metric or "euclidean"
-            return Problem(robot, task, metric, domain, Path(name).stem, self.least_singular_value)
+                box = default_box(robot, centre, half_width)
+            return Problem(robot, task, self.metric or "euclidean", box, Path(name).stem, self.least_singular_value)
         if name not in problems.names():
             raise UnknownNameError("problem or robot", name, (*problems.names(), *list_robot_files(), "or a FILE.urdf"))
         # A named problem, with what the options change.
