@@ -815,7 +815,8 @@ def test_command_fits_a_branch(run: Run) -> None:
     assert ": xi1: like swivel [rad]" in out
     message = "orthocas: --domain branch has a solver of its own: leave out --solver\n"
     assert run(*words, "--domain", "branch", "--solver", "lbfgs")[::2] == (2, message)
-    message = "orthocas: no such option: --branch; the branch is named by --domain branch:NAME\n"
+    words_of_python = "Python asks for one: arm.solve(x, xi, branch=NAME)"
+    message = f"orthocas: no such option: --branch; fit names the branch by --domain branch:NAME; {words_of_python}\n"
     assert run("fit", "iiwa", "--branch", "up")[::2] == (2, message)
 
 
