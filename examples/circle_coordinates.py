@@ -31,7 +31,7 @@ from paper.style import joint_plane
 
 import orthocas as oc
 from orthocas.bases import JointSpace
-from orthocas.bases.circle import CircleFamily
+from orthocas.bases.composed import CircleFamily
 from orthocas.bases.products import ProductFamily
 from orthocas.charts.coordinates import Coordinates
 from orthocas.solvers import GaussNewton

@@ -1,9 +1,7 @@
 """Minimisers behind one protocol (`orthocas.solvers.protocol.Solver`)."""
 
-from orthocas.solvers.adam import Adam
 from orthocas.solvers.casadi_solvers import GradientFlow, Ipopt
-from orthocas.solvers.gauss_newton import GaussNewton
-from orthocas.solvers.lbfgs import LBFGS, QuasiNewton
+from orthocas.solvers.minimisers import LBFGS, Adam, GaussNewton, QuasiNewton
 from orthocas.solvers.protocol import Solver
 from orthocas.tools.checks import require_known
 

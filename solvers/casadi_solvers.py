@@ -266,11 +266,9 @@ class _Flow:
         while best.iterations < limit:
             if not self._advance(integrator, node):
                 return Status.STALLED
-            before, self.value = self.value, self.objective.value(self.theta)
-            best.evaluations += 1
+            before, self.value = self.value, best.evaluate(self.theta)
             if not np.isfinite(self.value):
                 return Status.STALLED
-            best.offer(self.theta, self.value)
             self.stretch *= 2
             converged = before - self.value <= self.settings.tolerance * before and best.iterations >= 5
             best.next_iteration(limit)

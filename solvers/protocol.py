@@ -182,11 +182,6 @@ class BestPoint:
         self._start = time.perf_counter()
 
     @property
-    def seconds(self) -> float:
-        """Time spent."""
-        return time.perf_counter() - self._start
-
-    @property
     def found(self) -> bool:
         """Whether there is a point with a finite value."""
         return bool(np.isfinite(self.value))
@@ -197,6 +192,13 @@ class BestPoint:
         if better:
             self.theta, self.value = np.array(theta), float(value)
         return better
+
+    def evaluate(self, theta: Array) -> float:
+        """Evaluate the objective alone, and take the point if it is better; returns the value."""
+        value = self.objective.value(theta)
+        self.evaluations += 1
+        self.offer(theta, value)
+        return value
 
     def value_and_gradient(self, theta: Array) -> tuple[float, Array]:
         """Evaluate the objective, and take the point if it is better."""
@@ -225,4 +227,5 @@ class BestPoint:
         """The result. Its status is FAILED if no point (that satisfies the constraints) has a finite value."""
         if not self.found and status is not Status.INFEASIBLE:
             status = Status.FAILED
-        return SolveResult(self.theta, self.value, status, self.iterations, self.evaluations, self.seconds)
+        seconds = time.perf_counter() - self._start
+        return SolveResult(self.theta, self.value, status, self.iterations, self.evaluations, seconds)

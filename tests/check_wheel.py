@@ -50,7 +50,7 @@ def main() -> None:
         for wanted in (
             "orthocas/problems/data/iiwa7_r800.urdf",
             "orthocas/py.typed",
-            "solvers/lbfgs.py",
+            "solvers/minimisers.py",
             "charts/licences/MPL-2.0.txt",
             "charts/licences/NOTICE.txt",
         ):

@@ -32,7 +32,7 @@ from simulate_command import SHORT
 import orthocas as oc
 from orthocas import problems
 from orthocas.arms import kernel as arm_kernel
-from orthocas.charts import motion_kernel, point_quality, quality
+from orthocas.charts import curve_tracer, point_quality, quality
 from orthocas.cli import simulate
 from orthocas.cli.entry import main
 from orthocas.codegen import CompiledLibrary, GeneratedC, Supervisor, compile_shared, compiled, compiled_inverse
@@ -46,7 +46,7 @@ from orthocas.tools.checks import Array
 compile_shared.__defaults__ = (("-O0",), None)  # users' -O2 takes gcc three times as long, and computes the same
 compiled._FLAGS, compiled_inverse._FLAGS = ("-O1",), (*STRICT, "-O1")  # as their -O2 and -O3; here it runs for longer
 arm_kernel._FLAGS = (*STRICT, "-O2")
-motion_kernel._FLAGS = (*STRICT, "-O1")
+curve_tracer._FLAGS = (*STRICT, "-O1")
 
 
 def _search_briefly(value: point_quality.Value, domain: oc.Domain, seed: int = 0) -> Array:

@@ -28,7 +28,7 @@ IN_WHEEL = (
     "orthocas/py.typed",
     "orthocas/problems/data/iiwa7_r800.urdf",
     "orthocas/viewer/page.js",
-    "solvers/lbfgs.py",
+    "solvers/minimisers.py",
     "licenses/LICENSE",
 )
 NOT_IN_WHEEL = ("tests/", "docs/", "benchmarks/", "examples/", "tools/")

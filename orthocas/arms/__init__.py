@@ -1,9 +1,9 @@
 """The whole arm: every posture of a task value on all branches, and trackers that are never lost.
 
 `arm.Arm` holds a task with r = 1 and charts of branches. `kernel` finds the self-motion curves of a task value, in
-compiled C, from postures of `stored`. `self_motion` cuts them at joint limits, and answers questions about them.
-`chart_kernel` compiles the search for postures with x and xi, and the tracker, which `tracker` calls. `targets` reads
-task values as people hold them, and `maps` holds what all of these need of the robot.
+compiled C, from stored postures. `self_motion` cuts them at joint limits, and answers questions about them.
+`chart_kernel` compiles the search for postures with x and xi, and the tracker, which `tracker` calls. `maps` holds
+what all of these need of robot and task, and reads task values as people hold them.
 """
 
 from orthocas.arms.arm import Arm, Postures

@@ -14,12 +14,12 @@ from numpy.typing import ArrayLike
 from orthocas.arms.arm_file import read_charts, write_charts
 from orthocas.arms.chart_kernel import ChartKernel, write_tracker
 from orthocas.arms.maps import ArmMaps
-from orthocas.arms.self_motion import Arc, SelfMotions, find_motions
+from orthocas.arms.self_motion import SelfMotions, find_motions
 from orthocas.arms.tracker import ArmTracker, TrackStatus
 from orthocas.charts.chart import Chart
-from orthocas.charts.clearance import Clearance
 from orthocas.charts.inverse import InverseStatus
 from orthocas.charts.ready import load, names
+from orthocas.charts.walls import Clearance, require_collisions
 from orthocas.codegen.generate import require_free_folder, require_name
 from orthocas.errors import BranchWarning, DomainError, InvalidValueError, NotRedundantError, ShapeError, warn_caller
 from orthocas.fitting.wide import fit_wide
@@ -157,7 +157,11 @@ class Arm(Shown):
         # All charts and the arm speak of the same x.
         for chart in self.charts:
             require_kind("charts", chart, Chart)
-            same = chart.problem.task.recipe == self.task.recipe or _agree(chart, self.task)
+            same = chart.problem.task.recipe == self.task.recipe
+            if not same and (chart.m, chart.n) == (self.task.m, robot.n):
+                home = chart.problem.domain.home[None]
+                values = chart.problem.task.batched(home)[0], self.task.batched(home)[0]
+                same = np.allclose(*values, rtol=0, atol=1e-9)
             if not same:
                 raise InvalidValueError("charts", f"one of the task {chart.problem.task.name}", self.task.name)
         object.__setattr__(self, "charts", tuple(self.charts))
@@ -313,7 +317,7 @@ class Arm(Shown):
         """
         self.require_one_free()
         require_kind("all", all, bool)
-        self._check_collisions(collisions)
+        require_collisions(collisions, self.robot.tree)
         require_kind("branch", branch, str)
         if branch != ANY:
             require_known("branch", branch, self.branch_names)
@@ -568,21 +572,22 @@ class Arm(Shown):
             domains = [self.charts[k].problem.domain for k in chosen]
 
             def solve_row(row: int) -> None:
+                # the best of postures 0.05 rad apart on the arcs that lie in one of the domains
                 start = None if starts is None else starts[row]
-                motions = find_motions(self.maps, targets[row], *(() if start is None else (start[None],)))
-                if motions.components:
-                    q[row] = self._choose_inside(motions, domains, start)
+                places = self._spread_postures(targets[row], start)
+                inside = np.vstack([self._find_inside(places, domain) for domain in domains])
+                if len(inside):
+                    q[row] = inside[self._choose(inside, start)]
 
             run_in_threads(solve_row, range(len(targets)))
         return q, np.where(np.isfinite(q[:, 0]), int(InverseStatus.FOUND), int(InverseStatus.NOT_FOUND))
 
-    def _choose_inside(self, motions: SelfMotions, domains: Sequence[Domain], start: Array | None) -> Array:
-        """A posture in one of the domains, of those 0.05 rad apart on the arcs; NaN where there is none."""
-        q = np.vstack([arc.at(self._list_places(arc)) for arc in motions])
-        q = np.vstack([self._find_inside(q, domain) for domain in domains])
-        if not len(q):
-            return np.full(self.robot.n, np.nan)
-        return np.asarray(q[self._choose(q, start)])
+    def _spread_postures(self, target: Array, start: Array | None) -> Array:
+        """Postures (P, n) on all arcs of a target, at most `RULES.spacing` apart."""
+        motions = find_motions(self.maps, target, *(() if start is None else (start[None],)))
+        counts = [max(2, int(arc.length / RULES.spacing) + 2) for arc in motions]
+        q = [arc.at(np.linspace(0.0, arc.length, count)) for arc, count in zip(motions, counts, strict=True)]
+        return np.vstack([np.empty((0, self.robot.n)), *q])
 
     def _find_inside(self, q: Array, domain: Domain) -> Array:
         """Those of postures (N, n) that a domain holds, after full turns of joints without limits into its box."""
@@ -609,8 +614,7 @@ class Arm(Shown):
                     0 if start is None else np.linalg.norm(exact - start, axis=1).argmin()
                 ], InverseStatus.FOUND
         # Otherwise, of free postures on the arcs ...
-        motions = find_motions(self.maps, target, *(() if start is None else (start[None],)))
-        q = np.vstack([np.empty((0, self.robot.n)), *(arc.at(self._list_places(arc)) for arc in motions)])
+        q = self._spread_postures(target, start)
         q = q[collisions.check_free(q)] if len(q) else q
         owners = np.zeros(len(q), dtype=np.int64)
         if not (xi is None and anywhere):
@@ -625,28 +629,14 @@ class Arm(Shown):
             return q[np.argmin(away)], InverseStatus.NEAREST
         return q[self._choose(q, start)], InverseStatus.FOUND
 
-    def _check_collisions(self, collisions: Collisions | None) -> None:
-        """Raise InvalidValueError for what is no collision model of the robot."""
-        if collisions is not None:
-            require_kind("collisions", collisions, Collisions)
-            collisions.require_for(self.robot.tree)
-
     def _choose(self, q: Array, start: Array | None) -> int:
-        """The number of the posture nearest to a start, or without one, farthest from the limits."""
-        if start is None:
-            return int(np.argmax(self._measure_room(q)))
-        return int(np.argmin(np.linalg.norm(q - start, axis=1)))
-
-    def _measure_room(self, q: Array) -> Array:
-        """Distances from the limits (N,), in half-widths of the joints' ranges."""
+        """The number of the posture nearest to a start, or without one, farthest from the limits, in half-widths."""
+        if start is not None:
+            return int(np.argmin(np.linalg.norm(q - start, axis=1)))
         low, high = self.robot.lower, self.robot.upper
         bounded = np.isfinite(low)
         room = np.minimum(q - low, high - q)[:, bounded] / (high - low)[bounded]
-        return np.asarray(2 * room.min(axis=1, initial=1.0))
-
-    def _list_places(self, arc: Arc) -> Array:
-        """Places on an arc, at most `RULES.spacing` apart, (P,)."""
-        return np.linspace(0.0, arc.length, max(2, int(arc.length / RULES.spacing) + 2))
+        return int(np.argmax(2 * room.min(axis=1, initial=1.0)))
 
     def _evaluate_xi(self, q: Array, owners: Indices) -> Array:
         """xi (N,) of postures in the charts that hold them; NaN elsewhere."""
@@ -663,10 +653,3 @@ def _repeat_rows(name: str, rows: Array, count: int) -> Array:
     if len(rows) not in (1, count):
         raise ShapeError(name, rows.shape, (count, rows.shape[1]))
     return np.broadcast_to(rows, (count, rows.shape[1]))
-
-
-def _agree(chart: Chart, task: Task) -> bool:
-    """Whether a chart's task has the values of another one."""
-    q = chart.problem.domain.home[None]
-    same = chart.m == task.m and chart.n == task.robot.n
-    return same and bool(np.allclose(chart.problem.task.batched(q)[0], task.batched(q)[0], rtol=0, atol=1e-9))

@@ -150,7 +150,7 @@ class ChartPostures:
         begins = np.cumsum([0, *(len(part) for part in own)])
         return cls(
             np.ascontiguousarray(q),
-            np.ascontiguousarray(maps.places.of_postures(q), dtype=np.float32),
+            np.ascontiguousarray(maps.targets_of(q) / maps.place_sizes, dtype=np.float32),
             np.ascontiguousarray(np.vstack([*xi, np.zeros((len(free), r))]), dtype=np.float32),
             begins.astype(np.intc),
         )
@@ -185,16 +185,13 @@ class ChartKernel:
         q = np.empty((count, n))
         status, owner = (np.empty(count, dtype=np.intc) for _ in range(2))
         # Which charts may answer.
-        flags = np.zeros(len(self.charts), dtype=np.int8)
-        flags[list(allowed)] = 1
-        solve, stored, whole = self._c.solve_rows, self.postures.in_c, self._range
-        # Room for the points of all curves of a target, and for distances (float) of the stored postures.
-        room_size = CURVES.nodes * (2 * n + 1) + (len(self.maps.stored.q) + 1) // 2
+        flags = np.isin(np.arange(len(self.charts)), allowed).astype(np.int8)
+        solve, stored, whole = self.library.solve_rows, self.postures.in_c, self._range
         inputs = [np.ascontiguousarray(part) for part in (targets, xi)]
         first = None if starts is None else np.ascontiguousarray(starts)
 
         def solve_piece(begin: int) -> None:
-            rows, room = slice(begin, begin + RULES.piece), np.empty(room_size)
+            rows, room = slice(begin, begin + RULES.piece), self._build_room()
             start = None if first is None else pointer(first[rows])
             solve(
                 *(len(q[rows]), *(pointer(part[rows]) for part in inputs), start, pointer(flags)),
@@ -215,11 +212,9 @@ class ChartKernel:
         Raises:
             InvalidValueError: if there are more than 1,000.
         """
-        flags, n = np.zeros(len(self.charts), dtype=np.int8), self.maps.robot.n
-        flags[list(allowed)] = 1
-        room = np.empty(CURVES.nodes * (2 * n + 1) + (len(self.maps.stored.q) + 1) // 2)
-        q, owner = np.empty((RULES.every, n)), np.empty(RULES.every, dtype=np.intc)
-        count = self._c.solve_all(
+        flags, room = np.isin(np.arange(len(self.charts)), allowed).astype(np.int8), self._build_room()
+        q, owner = np.empty((RULES.every, self.maps.robot.n)), np.empty(RULES.every, dtype=np.intc)
+        count = self.library.solve_all(
             *(pointer(target), ctypes.c_double(xi), None if start is None else pointer(np.ascontiguousarray(start))),
             *(pointer(flags), ctypes.byref(self._range), CURVES.patience, pointer(room), CURVES.nodes),
             *(pointer(q), pointer(owner), RULES.every),
@@ -228,10 +223,14 @@ class ChartKernel:
             raise InvalidValueError("xi", f"{xi:g}, which more than {RULES.every} postures have", "fewer postures")
         return q[:count], owner[:count].astype(np.int64)
 
+    def _build_room(self) -> Array:
+        """Room for the points of all curves of a target, and for distances (float) of the stored postures."""
+        return np.empty(CURVES.nodes * (2 * self.maps.robot.n + 1) + (len(self.maps.stored.q) + 1) // 2)
+
     def build_targets(self, vectors: Array) -> Array:
         """As `TargetReader.build`, of contiguous vectors (N, m)."""
         targets = np.empty((len(vectors), self.target_size))
-        self._c.build_targets(len(vectors), pointer(vectors), pointer(targets))
+        self.library.build_targets(len(vectors), pointer(vectors), pointer(targets))
         return targets
 
     @cached_property
@@ -239,28 +238,9 @@ class ChartKernel:
         """From which searches start."""
         return ChartPostures.build(self.maps, self.charts, RULES.postures)
 
-    @property
-    def track(self) -> Any:
-        """`arm_track` of the library."""
-        return self._c.arm_track
-
-    @property
-    def track_value(self) -> Any:
-        """The same for x as the task's vector."""
-        return self._c.track_value
-
-    @property
-    def reset(self) -> Any:
-        """`arm_track_reset` of the library."""
-        return self._c.arm_track_reset
-
-    @property
-    def hold(self) -> Any:
-        """`arm_track_hold` of the library."""
-        return self._c.arm_track_hold
-
     @cached_property
-    def _c(self) -> Any:
+    def library(self) -> Any:
+        """The compiled library; trackers call `arm_track`, `track_value`, and `arm_track_reset` and `_hold`."""
         sources = write_tracker(self.maps, self.charts, "arm", "arm_rows.c")
         if self.charts and self.maps.robot.n - self.maps.task.m == 1:
             sources |= write_curves(self.maps.equations, *self._limits)
@@ -323,7 +303,7 @@ def write_tracker(
     size = equations.size1_in(1)
     # How the header describes a target.
     words = f"its vector ({size})"
-    if maps.places.turned:
+    if maps.turned:
         words = "the rotation (3, 3) of the frame by columns"
         words = f"the position (3), then {words}" if size > 9 else words
     values = {
@@ -337,8 +317,8 @@ def write_tracker(
         "n": n,
         "m": task.m,
         "target": size,
-        "places": len(maps.place_scale),
-        "place_scale": maps.place_scale,
+        "places": len(maps.place_sizes),
+        "place_scale": 1 / maps.place_sizes,
         "charts": parts,
         "rules": {name: value for name, value in asdict(RULES).items() if name != "lifts"},
         "curve_rules": asdict(CURVES),

@@ -8,7 +8,6 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocas.arms.stored import StoredPostures
 from orthocas.native.curves import RULES
 from orthocas.native.kernels import generate_kernels
 from orthocas.native.libraries import keep_library, load_library, pointer
@@ -58,6 +57,20 @@ def evaluate_cubic(
     return q, slope / np.maximum(np.linalg.norm(slope, axis=-1, keepdims=True), 1e-300)
 
 
+@dataclass(frozen=True, eq=False)
+class StoredPostures:
+    """Random postures within the limits, in the order of the branches, and where they are in x.
+
+    Those near a value of x are taken by |x - x_d|^2 det(J J^T)^(-1/m): then each self-motion curve gets a part of them
+    like its part of the length of all curves, whatever its distance from singular positions.
+    """
+
+    q: Array  #: (S, n)
+    places: NDArray[np.float32]  #: (k, S): distances between them are errors of x
+    weights: NDArray[np.float32]  #: of squared distances, (S,)
+    begins: NDArray[np.intc]  #: numbers of the first posture of each branch, and S
+
+
 def crossing_type(n: int) -> np.dtype[Any]:
     """A record of a crossing: a joint, less full turns, is at its lowest (side 0) or highest (1) position."""
     fields: list[Any] = [("place", "f8"), ("q", "f8", (n,))]
@@ -93,11 +106,19 @@ class CurveKernel:
         )
         if not count:
             return []
-        found = np.empty(RULES.crossings, crossing_type(n))
+        room = np.empty(RULES.crossings, crossing_type(n))
         size = self._c.find_crossings(
-            pointer(target), pointer(nodes), pointer(ends), count, pointer(found), RULES.crossings
+            pointer(target), pointer(nodes), pointer(ends), count, pointer(room), RULES.crossings
         )
-        return split_curves(nodes[: ends[count - 1]].copy(), ends[:count], closed, found[:size].copy())
+        # Crossings come curve by curve, and are put in the order of places within each.
+        nodes, crossings, curves, begin = nodes[: ends[count - 1]].copy(), room[:size].copy(), [], 0
+        parts = np.searchsorted(crossings["curve"], np.arange(count + 1)).tolist()
+        for k, end in enumerate(ends[:count].tolist()):
+            own, part = crossings[parts[k] : parts[k + 1]], nodes[begin:end]
+            own = own[np.argsort(own["place"], kind="stable")]
+            curves.append(Curve(part[:, :n], part[:, n : 2 * n], part[:, 2 * n], bool(closed[k]), own))
+            begin = end
+        return curves
 
     def choose_starts(self, stored: StoredPostures, place: Array) -> Array:
         """Stored postures near a place of x, in turn from each branch, (S, n)."""
@@ -169,22 +190,6 @@ def write_curves(equations: ca.Function, lower: Array, upper: Array, turning: ND
     return {"task_curves.c": render("task_curves.c", values), **included}
 
 
-def split_curves(
-    nodes: Array, ends: NDArray[np.intc], closed: NDArray[np.intc], crossings: NDArray[Any]
-) -> list[Curve]:
-    """Curves from the points of all of them, (P, 2n + 1), and from all crossings, which come curve by curve."""
-    n, curves, begin = (nodes.shape[1] - 1) // 2, [], 0
-    # Crossings come curve by curve; within one, in the order of places.
-    parts = np.searchsorted(crossings["curve"], np.arange(len(ends) + 1)).tolist()
-    for k, end in enumerate(ends.tolist()):
-        own = crossings[parts[k] : parts[k + 1]]
-        own = own[np.argsort(own["place"], kind="stable")]
-        part = nodes[begin:end]
-        curves.append(Curve(part[:, :n], part[:, n : 2 * n], part[:, 2 * n], bool(closed[k]), own))
-        begin = end
-    return curves
-
-
 def build_equations(task: Task, scale: Array) -> ca.Function:
     """q (n, 1), target -> e (m, 1) and J (m, n), both divided by the scale; d(e)/dt = -J dq at e = 0.
 
@@ -216,8 +221,6 @@ def build_curvature(equations: ca.Function) -> ca.Function:
     """q (n, 1), target -> the second derivative of |e|^2 / 2, (n, n): that of J and e of `build_equations`."""
     q, target = (ca.SX.sym(name, equations.size1_in(i)) for i, name in enumerate(("q", "target")))
     e, J = equations(q, target)
-    # The gradient of
-    # e
-    # ^2 / 2 is -J^T e.
+    # The gradient of |e|^2 / 2 is -J^T e.
     H = ca.jacobian(-J.T @ e, q)
     return dense_function("curvature", [q, target], [ca.cse((H + H.T) / 2)], ["q", "target"])

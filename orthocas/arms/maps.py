@@ -1,26 +1,39 @@
-"""What every part of an arm needs of its robot and task, built on first use."""
+"""What every part of an arm needs of its robot and task, built on first use, and task values as people hold them."""
+
+from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocas.arms.kernel import Curve, CurveKernel, build_equations
-from orthocas.arms.stored import PlaceReader, StoredPostures
-from orthocas.arms.targets import TargetReader
-from orthocas.charts.self_motion import Stop
+from orthocas.arms.kernel import Curve, CurveKernel, StoredPostures, build_equations
+from orthocas.charts.walls import Stop
+from orthocas.errors import InvalidValueError
 from orthocas.robots.robot import Robot
 from orthocas.tasks.branches import branches
 from orthocas.tasks.domains import Box, StopKind
 from orthocas.tasks.regular_box import find_joint_range
 from orthocas.tasks.samples import sample_evenly
-from orthocas.tasks.task import Task
+from orthocas.tasks.task import Frames, Task
 from orthocas.tools.batch import Batched, dense_function, use_threads
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array
+from orthocas.tools.checks import Array, as_float_array
 
-_SCALED = 2000  # postures from which the lengths of rows of J are taken
+
+@dataclass(frozen=True, slots=True)
+class MapRules:
+    """Numbers of scales and stored postures."""
+
+    scaled: int = 2000  #: postures from which the lengths of rows of J are taken
+    stored: int = 20_000  #: postures from which searches start
+    seed: int = 0  #: of them
+    least_volume: float = 1e-12  #: det(J J^T) of postures that count as singular
+
+
+RULES = MapRules()
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,7 +52,7 @@ class ArmMaps:
         """What components of errors are divided by, (m,): 1 for angles, else how far a joint moves them, per radian."""
         # Lengths of the rows of J for revolute joints, at even postures; one for each unit, such as all positions.
         whole = find_joint_range(self.robot, 0)
-        q = sample_evenly(Box(whole.centre, whole.half_width), _SCALED, 0)
+        q = sample_evenly(Box(whole.centre, whole.half_width), RULES.scaled, 0)
         J = Batched(build_equations(self.task, np.ones(self.task.m)))(q, np.tile(self._some_target, (len(q), 1)))[1]
         lengths = (J.reshape(len(q), self.task.m, self.robot.n) ** 2)[:, :, self.turning].sum(axis=2)
         lengths = np.where(np.isfinite(lengths), lengths, 0.0)
@@ -59,7 +72,7 @@ class ArmMaps:
     def target_function(self) -> ca.Function:
         """x (m, 1) -> target (k, 1), as `TargetReader.build`."""
         task, x = self.task, ca.SX.sym("x", self.task.m)
-        if not self.places.turned:
+        if not self.turned:
             return dense_function("target", [x], [x], ["x"])
         # R(x) by Rodrigues' formula, R = 1 + 2 w [v] + 2 [v]^2, on the task's reference.
         w, *axis = ca.vertsplit(task.quaternion_function(x))
@@ -69,10 +82,13 @@ class ArmMaps:
         return dense_function("target", [x], [ca.vertcat(*position, ca.vec(R))], ["x"])
 
     @cached_property
-    def place_scale(self) -> Array:
-        """A place is a target times this, (k,)."""
-        probe = np.ones(len(self._some_target))
-        return np.asarray(self.places.of_targets(probe.copy()) / probe)
+    def place_sizes(self) -> Array:
+        """A target divided by these is a place: distances of places are errors of x, as of `equations`, (k,)."""
+        if not self.turned:
+            return self.scale
+        # |R - S| / sqrt(2) is the angle between both, for small ones.
+        position = self.scale[:3] if self.task.turn is not None and self.task.turn.with_position else np.zeros(0)
+        return np.concatenate([position, np.full(9, np.sqrt(2))])
 
     @cached_property
     def kernel(self) -> CurveKernel:
@@ -81,15 +97,26 @@ class ArmMaps:
 
     @cached_property
     def stored(self) -> StoredPostures:
-        """Postures from which searches start."""
+        """Random postures from which searches start."""
         # Others may wait for this value, so no other threads take part.
         with use_threads(1):
-            return StoredPostures.build(self.places, self._evaluate_rates, branches(self.robot, self.task))
-
-    @cached_property
-    def places(self) -> PlaceReader:
-        """Reads places of x."""
-        return PlaceReader(self.task, self.scale)
+            robot, parts = self.robot, branches(self.robot, self.task)
+            whole, rng = find_joint_range(robot, 0), np.random.default_rng(RULES.seed)
+            low, high = whole.centre - whole.half_width, whole.centre + whole.half_width
+            q = rng.uniform(low, high, (RULES.stored, robot.n))
+            # In the order of branches; postures of none come last.
+            own = np.full(len(q), len(parts))
+            for k, branch in enumerate(parts):
+                own[np.asarray(branch.box.contains(q))] = k
+            order = np.argsort(own, kind="stable")
+            q, own = q[order], own[order]
+            # Next to singular positions, x moves less for the same way of joints: distances there count more.
+            J = self.evaluate(q, np.tile(self._some_target, (len(q), 1)))[1]
+            volume = np.linalg.det(J @ J.transpose(0, 2, 1))
+            weights = np.maximum(volume, RULES.least_volume) ** (-1 / self.task.m)
+            places = np.ascontiguousarray((self.targets_of(q) / self.place_sizes).T, dtype=np.float32)
+        begins = np.flatnonzero(np.diff(own, prepend=-1, append=len(parts) + 1))
+        return StoredPostures(q, places, weights.astype(np.float32), begins.astype(np.intc))
 
     @cached_property
     def targets(self) -> TargetReader:
@@ -118,12 +145,12 @@ class ArmMaps:
 
     def find_curves(self, target: Array, *starts: Array) -> list[Curve]:
         """The curves of a target (k,), from starts (S, n) of one's own and from stored postures."""
-        near = self.kernel.choose_starts(self.stored, self.places.of_targets(target))
+        near = self.kernel.choose_starts(self.stored, target / self.place_sizes)
         return self.kernel.find_curves(target, np.ascontiguousarray(np.vstack([*starts, near])))
 
     def choose_postures(self, targets: Array, starts: Array | None) -> Array:
         """Postures (N, n) of targets (N, k), as of the kernel."""
-        return self.kernel.choose_postures(targets, starts, self.stored, self.places.of_targets(targets))
+        return self.kernel.choose_postures(targets, starts, self.stored, targets / self.place_sizes)
 
     def evaluate(self, q: Array, targets: Array) -> tuple[Array, Array]:
         """Errors e (N, m) and rates J (N, m, n) of postures (N, n) and targets (N, k)."""
@@ -132,18 +159,21 @@ class ArmMaps:
 
     def targets_of(self, q: Array) -> Array:
         """Targets (N, k) that postures (N, n) meet."""
-        places = self.places
-        if not places.turned:
-            return np.ascontiguousarray(self.task.batched(q)[0])
-        # Places are targets times `place_scale`, so back again.
-        targets = places.of_postures(q) * np.sqrt(2)
-        if targets.shape[1] > 9:
-            targets[:, :3] *= self.scale[:3] / np.sqrt(2)
-        return np.ascontiguousarray(targets)
+        task = self.task
+        if not self.turned:
+            return np.ascontiguousarray(task.batched(q)[0])
+        frames = Frames.from_recipe(task.recipe)
+        frame = task.robot.tree.tip_name if frames.frame is None else frames.frame
+        R = np.asarray(task.robot.frame_rotation(q, frame, frames.relative_to)).reshape(-1, 3, 3)
+        parts = [R.transpose(0, 2, 1).reshape(-1, 9)]
+        if task.turn is not None and task.turn.with_position:
+            parts.insert(0, np.asarray(task.robot.frame_position(q, frame, frames.relative_to)).reshape(-1, 3))
+        return np.hstack(parts)
 
-    def _evaluate_rates(self, q: Array) -> Array:
-        """J (N, m, n) of postures (N, n)."""
-        return self.evaluate(q, np.tile(self._some_target, (len(q), 1)))[1]
+    @property
+    def turned(self) -> bool:
+        """Whether x holds a whole orientation."""
+        return self.task.turn is not None and self.task.turn.whole
 
     @cached_property
     def _batched_equations(self) -> Batched:
@@ -155,3 +185,70 @@ class ArmMaps:
         if turn is None or not turn.whole:
             return np.zeros(self.task.m)
         return np.concatenate([np.zeros(3 if turn.with_position else 0), np.eye(3).ravel()])
+
+
+@dataclass(frozen=True, eq=False)
+class TargetReader:
+    """Reads values of x of a task, and turns them into targets of `orthocas.arms.kernel.build_equations`."""
+
+    task: Task
+
+    def read(self, x: Any) -> tuple[Array, bool]:
+        """Targets (N, k) of what `Task.target` takes, and whether it is one value. Rows of vectors need not be finite.
+
+        A single pose with NaN is a target of NaN.
+
+        Raises:
+            ShapeError, InvalidValueError: if x is none of what the task can have.
+        """
+        m = self.task.m
+        # Poses with NaN, which a broken sensor sends, are a target that trackers answer with BAD_INPUT.
+        try:
+            values = self.task.target(x)
+        except InvalidValueError:
+            if not _is_pose_with_nan(x):
+                raise
+            values = np.full(m, np.nan)
+        if values.ndim not in (1, 2) or values.shape[-1] != m:
+            raise InvalidValueError("x", f"an array of shape {values.shape}", f"({m},), (N, {m}), or poses of the task")
+        return self.build(values.reshape(-1, m)), values.ndim == 1
+
+    def build(self, vectors: Array) -> Array:
+        """Targets (N, k) of vectors (N, m), finite or not."""
+        turn = self.task.turn
+        if turn is None or not turn.whole:
+            return np.ascontiguousarray(vectors)
+        # Rows that are not finite have no rotation; they stay NaN.
+        good = np.asarray(np.isfinite(vectors).all(axis=1))
+        targets = np.full((len(vectors), 12 if turn.with_position else 9), np.nan)
+        if good.any():
+            R = np.asarray(self.task.orientation_of(vectors[good]))
+            targets[good, -9:] = R.transpose(0, 2, 1).reshape(-1, 9)
+            if turn.with_position:
+                targets[good, :3] = vectors[good, :3]
+        return targets
+
+    def vector(self, targets: Array) -> Array:
+        """Targets (N, k) as vectors of x (N, m); NaN where a target is NaN."""
+        turn = self.task.turn
+        if turn is None or not turn.whole:
+            return targets
+        values = np.full((len(targets), self.task.m), np.nan)
+        good = np.isfinite(targets).all(axis=1)
+        if good.any():
+            R = targets[good, -9:].reshape(-1, 3, 3).transpose(0, 2, 1)
+            values[good] = self.task.value(targets[good, :3] if turn.with_position else None, R)
+        return values
+
+
+def _is_pose_with_nan(x: Any) -> bool:
+    """Whether x is one pose of which a number is not finite."""
+    parts = (x.translation, x.rotation) if hasattr(x, "rotation") and hasattr(x, "translation") else x
+    parts = parts if isinstance(parts, tuple) and len(parts) == 2 else (parts,)
+    try:
+        arrays = [as_float_array("x", part) for part in parts]
+    except InvalidValueError:
+        return False
+    shapes = [array.shape for array in arrays]
+    whole = shapes in ([(4, 4)], [(3,), (4,)], [(3,), (3, 3)])
+    return whole and not all(np.isfinite(array).all() for array in arrays)

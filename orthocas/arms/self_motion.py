@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from orthocas.arms.kernel import Curve, build_curvature, evaluate_cubic
 from orthocas.arms.maps import ArmMaps
-from orthocas.charts.self_motion import Stop
+from orthocas.charts.walls import Stop
 from orthocas.errors import InvalidValueError
 from orthocas.tasks.domains import StopKind
 from orthocas.tasks.metric import Metric, MetricSpec
@@ -326,7 +326,13 @@ class SelfMotions(Shown):
         Raises:
             InvalidValueError: if there are no such components, or they are the same.
         """
-        first, second = self._require_pair(a, b)
+        for name, k in (("a", a), ("b", b)):
+            require_kind(name, k, int)
+            if not 0 <= k < len(self):
+                raise InvalidValueError(name, k, f"the number of one of {len(self)} components, from 0 on")
+        if a == b:
+            raise InvalidValueError("b", b, "another component than a")
+        first, second = self.components[a], self.components[b]
         spaced = [np.linspace(0.0, arc.length, max(2, int(arc.length / RULES.spacing) + 2)) for arc in (first, second)]
         rows = [arc.at(places) for arc, places in zip((first, second), spaced, strict=True)]
         apart = [np.linalg.norm(self.measure_away(rows[1], q), axis=1) for q in rows[0]]
@@ -437,15 +443,6 @@ class SelfMotions(Shown):
             figure.axes[-1].set_xlabel("length along the component [rad]")
             figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside right upper", fontsize="small")
         return figure
-
-    def _require_pair(self, a: int, b: int) -> tuple[Arc, Arc]:
-        for name, k in (("a", a), ("b", b)):
-            require_kind(name, k, int)
-            if not 0 <= k < len(self):
-                raise InvalidValueError(name, k, f"the number of one of {len(self)} components, from 0 on")
-        if a == b:
-            raise InvalidValueError("b", b, "another component than a")
-        return self.components[a], self.components[b]
 
     def facts(self) -> dict[str, str]:
         """How many components there are, how long, and what stops them."""

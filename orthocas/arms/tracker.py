@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from orthocas.arms.chart_kernel import RULES, ChartKernel, tracker_type
-from orthocas.charts.clearance import Clearance
+from orthocas.charts.walls import Clearance
 from orthocas.errors import InvalidValueError, degrees_hint
 from orthocas.native.libraries import pointer
 from orthocas.tools.checks import Array, as_float_array, as_number, as_point, require_kind, require_shape
@@ -161,7 +161,7 @@ class ArmTracker(Shown):
             raise InvalidValueError("q", point.tolist(), f"a posture within the joint limits{hint}")
         if self._clearance is not None:
             self._clearance.start(point)
-        self._kernel.reset(self._at, pointer(np.ascontiguousarray(point)))
+        self._kernel.library.arm_track_reset(self._at, pointer(np.ascontiguousarray(point)))
 
     def step(self, x: Any, xi: ArrayLike | None = None, posture: ArrayLike | None = None) -> Array:
         """The next posture (n,); see `status`.
@@ -190,19 +190,19 @@ class ArmTracker(Shown):
         # A plain vector is read in C, which is most of the time of a call.
         if type(x) is np.ndarray and x.dtype == np.float64 and x.shape == (maps.task.m,):
             self._x[:] = x
-            return self._move(self._kernel.track_value, self._x_at, wished)
+            return self._move(self._kernel.library.track_value, self._x_at, wished)
         targets, single = maps.targets.read(x)
         if not single:
             raise InvalidValueError("x", f"{len(targets)} values", "one task value")
         self._target[:] = targets[0]
-        return self._move(self._kernel.track, self._target_at, wished)
+        return self._move(self._kernel.library.arm_track, self._target_at, wished)
 
     def step_to(self, target: Array, xi: ArrayLike | None) -> Array:
         """As `step`, for x as `orthocas.arms.kernel.build_equations` takes it."""
         if xi is not None:
             self._read_wish(xi)
         self._target[:] = target
-        return self._move(self._kernel.track, self._target_at, xi is not None)
+        return self._move(self._kernel.library.arm_track, self._target_at, xi is not None)
 
     def _read_wish(self, xi: ArrayLike | None) -> None:
         if not self._kernel.charts:
@@ -230,7 +230,7 @@ class ArmTracker(Shown):
         # What still comes nearer than the margin goes a part of the way.
         q, fraction = self._clearance.limit(before, self.q)
         if fraction < 1:
-            self._kernel.hold(self._at, pointer(np.ascontiguousarray(q)), int(TrackStatus.BRAKED))
+            self._kernel.library.arm_track_hold(self._at, pointer(np.ascontiguousarray(q)), int(TrackStatus.BRAKED))
         return self.q
 
     def _push(self, clearance: Clearance, memory: NDArray[np.void]) -> bool:
@@ -244,28 +244,24 @@ class ArmTracker(Shown):
         near = clearance.collisions.find_near(end, clearance.avoid - RULES.kept)
         if not len(near.distance):
             return False
-        known = [(self._state["push"][0, k].copy(), float(self._state["room"][0, k])) for k in range(self._pushes)]
+        count = int(self._state["pushes"][0])
+        known = [(self._state["push"][0, k].copy(), float(self._state["room"][0, k])) for k in range(count)]
         self._state[:] = memory
         rows = [
             (slope, clearance.avoid - distance + float(slope @ (end - memory["q"][0])))
             for distance, slope in zip(near.distance.tolist(), near.gradient, strict=True)
         ]
-        # Pairs of an earlier turn stay, unless this one knows them better.
-        rows = (rows + [(slope, room) for slope, room in known if not _is_known(slope, rows)])[: RULES.pushes]
+        fresh = len(rows)
+        # Pairs of an earlier turn stay, unless a row of this one has nearly their direction.
+        for slope, room in known:
+            least = RULES.aligned * float(np.linalg.norm(slope))
+            if not any(float(slope @ other) > least * float(np.linalg.norm(other)) for other, _ in rows[:fresh]):
+                rows.append((slope, room))
+        rows = rows[: RULES.pushes]
         for k, (slope, room) in enumerate(rows):
             self._state["push"][0, k], self._state["room"][0, k] = slope, room
         self._state["pushes"] = len(rows)
         return True
-
-    @property
-    def _pushes(self) -> int:
-        return int(self._state["pushes"][0])
-
-
-def _is_known(slope: Array, rows: list[tuple[Array, float]]) -> bool:
-    """Whether a row has nearly the direction of one of others."""
-    size = float(np.linalg.norm(slope))
-    return any(float(slope @ other) > RULES.aligned * size * float(np.linalg.norm(other)) for other, _ in rows)
 
 
 def _read_limits(name: str, limits: ArrayLike | None, default: Array) -> Array:

@@ -4,12 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
 
-from orthocas.bases.family import Expression, Family, JointSpace, Parametrisation, component_gradients
+from orthocas.bases.family import Cyclic
 from orthocas.errors import InvalidValueError
 from orthocas.robots.kinematics import TipTurn
 from orthocas.robots.tree import KinematicTree
@@ -23,19 +22,16 @@ from orthocas.tools.expressions import find_gradient_dependences, write_tape
 
 @dataclass(frozen=True, slots=True)
 class CyclicRules:
-    """Numbers of the test for cyclic joints, and of coordinates that move with a base."""
+    """Numbers of the test for cyclic joints."""
 
     samples: int = 24  #: joint positions at which a symmetry is tested
     positions: int = 6  #: other positions of one joint at each of them
     seed: int = 0
     largest_slide: float = 10.0  #: [m]; other positions of a prismatic joint without limits lie within
-    start: float = 0.03  #: of the arm's own start, where coordinates move with a base
-    on_plane: int = 3  #: coordinates that move with the base: two of its place, and the heading
 
 
 RULES = CyclicRules()
 _AXES = "xyz"
-_WORD, _WITHOUT = "cyclic", "without"
 
 
 def cyclic_joints(problem: Problem) -> tuple[str, ...]:
@@ -186,7 +182,13 @@ def keeps_self_motions(problem: Problem, joint: int) -> bool:
         return False
     # By the kinematics, h(q + t e_k) = g_t(h(q)).
     kind = task.recipe["kind"]
-    turned = TipTurn.from_kind(kind) is not None or _is_turn_of_components(tree, joint, kind)
+    turned = TipTurn.from_kind(kind) is not None
+    # Rotations about its axis map the position to itself, and two components of it if the third is along the axis.
+    name, _, axes = ("position:xy" if kind == "polar" else kind).partition(":")
+    if name == "position" and not tree.prismatic[joint]:
+        left_out = [k for k, axis in enumerate(_AXES) if axis not in axes]
+        across = len(left_out) == 1 and _is_axis(_fit_rotation(tree, joint, -1)[:, 2], left_out[0])
+        turned = not left_out or across
     if turns_tool(task, joint) or (task.of_tip and at_rest and turned):
         return True
     # By the steps of h, J_x does not depend on the joint.
@@ -204,15 +206,6 @@ def turns_tool(task: Task, joint: int) -> bool:
     return whole and joint == tree.tip_parent and joint not in tree.mimic_leaders
 
 
-def _is_turn_of_components(tree: KinematicTree, joint: int, kind: str) -> bool:
-    """Whether rotations about the axis of a joint map the position, or two components of it, to themselves."""
-    name, _, axes = ("position:xy" if kind == "polar" else kind).partition(":")
-    left_out = [k for k, axis in enumerate(_AXES) if axis not in axes]
-    if name != "position" or tree.prismatic[joint]:
-        return False
-    return not left_out or (len(left_out) == 1 and _is_axis(_fit_rotation(tree, joint, -1)[:, 2], left_out[0]))
-
-
 def _fit_rotation(tree: KinematicTree, joint: int, base: int) -> Array:
     """The rotation of a joint's frame, at zero, in that of a joint that carries it, or in the world for -1."""
     R: Array = np.eye(3)
@@ -226,63 +219,6 @@ def _fit_rotation(tree: KinematicTree, joint: int, base: int) -> Array:
 def _is_axis(direction: Array, k: int) -> bool:
     """Whether a direction is exactly that of a coordinate axis or its opposite."""
     return bool(np.flatnonzero(direction).tolist() == [k])
-
-
-Cyclic = tuple[str, ...] | Literal["auto"]  #: names of joints; "auto" for all cyclic joints of the problem
-
-
-def check_cyclic(value: Any) -> Cyclic:
-    """Return the joint names that were given, or "auto".
-
-    Raises:
-        InvalidValueError: if it is neither, or a name appears twice.
-    """
-    if isinstance(value, str) and value == "auto":
-        return "auto"
-    known = isinstance(value, list | tuple) and all(isinstance(name, str) for name in value)
-    if not known or len(set(value)) != len(value):
-        raise InvalidValueError("cyclic", repr(value)[:80], "a list of different joint names, or 'auto'")
-    return tuple(value)
-
-
-def check_without(names: Any, cyclic: Cyclic) -> tuple[str, ...]:
-    """Names of joints that coordinates do not depend on.
-
-    Raises:
-        InvalidValueError: if a name appears twice, or one is also cyclic.
-    """
-    known = isinstance(names, list | tuple) and all(isinstance(name, str) for name in names)
-    if not known or len(set(names)) != len(names) or (cyclic != "auto" and set(names) & set(cyclic)):
-        raise InvalidValueError("without", repr(names)[:80], "a list of different joint names, none of them cyclic")
-    return tuple(names)
-
-
-def suffix(cyclic: Cyclic, without: tuple[str, ...] = ()) -> str:
-    """What a label adds: ':cyclic' for "auto", ':cyclic=NAME,NAME', and ':without=NAME,NAME'."""
-    linear = "" if not cyclic else f":{_WORD}" if cyclic == "auto" else f":{_WORD}={','.join(cyclic)}"
-    return linear + (f":{_WITHOUT}={','.join(without)}" if without else "")
-
-
-def parse_suffix(text: str, before: str) -> tuple[Cyclic, tuple[str, ...]]:
-    """Parse what ends a label: '', 'cyclic' or 'cyclic=NAME,NAME', then 'without=NAME,NAME'.
-
-    Args:
-        text: the end of the label.
-        before: what may stand before it, for messages.
-    """
-    cyclic: Cyclic = ()
-    without: tuple[str, ...] = ()
-    for part in text.split(":") if text else ():
-        # each part is a word, with names behind it
-        word, equals, names = part.partition("=")
-        if word not in (_WORD, _WITHOUT) or (not names if equals else word == _WITHOUT):
-            wanted = f"{before}, then 'cyclic' or 'cyclic=JOINT,JOINT', then 'without=JOINT'"
-            raise InvalidValueError("parametrisation", repr(text), wanted)
-        if word == _WORD:
-            cyclic = tuple(names.split(",")) if equals else "auto"
-        else:
-            without = tuple(names.split(","))
-    return cyclic, without
 
 
 def resolved(cyclic: Cyclic, problem: Problem) -> tuple[str, ...]:
@@ -304,163 +240,6 @@ def resolved(cyclic: Cyclic, problem: Problem) -> tuple[str, ...]:
         if name not in known and not (name in names and keeps_self_motions(problem, names.index(name))):
             raise InvalidValueError("cyclic", repr(name), f"one of the cyclic joints: {', '.join(known) or 'none'}")
     return tuple(name for name in names if name in cyclic)
-
-
-def indices(cyclic: Cyclic, space: JointSpace) -> list[int]:
-    """The cyclic joints of a space, in order.
-
-    Raises:
-        InvalidValueError: if a name is not among the joints, or "auto" has not been resolved.
-    """
-    if cyclic == "auto":
-        raise InvalidValueError("cyclic", "'auto'", "joint names: for_problem(problem) finds them")
-    for name in cyclic:
-        if name not in space.joint_names:
-            raise InvalidValueError("cyclic", repr(name), f"joints of {', '.join(space.joint_names)}")
-    return [k for k, name in enumerate(space.joint_names) if name in cyclic]
-
-
-@dataclass(frozen=True)
-class Mobile:
-    """Coordinates that turn and shift with a base that moves on a plane.
-
-    With the place p = (x, y) and the heading t of the base, and functions f of the arm's joints a,
-
-        (xi_1, xi_2) = p + R(t) (f_1(a) + b_1, f_2(a) + b_2),  xi_3 = t + f_3(a),  xi_k = c_k t + f_k(a) for k > 3.
-
-    A motion of the plane turns and shifts (xi_1, xi_2), adds its angle to t, and does the same to the tip. So where the
-    metric does not depend on place and heading, J_x A^-1 J_xi^T and det J are those at p = 0, t = 0, up to a rotation:
-    a chart holds everywhere on the plane, and `fit` takes away the ends of the domain there.
-
-    Args:
-        arm: the parametrisation of f: polynomials, Fourier terms or networks, without cyclic joints.
-        base: names of the two joints that slide along the world's x and y, and of the one that turns about z after
-            them. Default: those of `Robot.from_urdf(..., base="planar")`.
-
-    Raises:
-        InvalidValueError: if f cannot be fitted, or the names are not three.
-
-    Example:
-        >>> import orthocas as oc
-        >>> oc.Mobile(oc.Polynomial(2)).label
-        'mobile:polynomial:2'
-
-    Source:
-        ours, docs/how-to/mobile_base.md.
-    """
-
-    arm: Parametrisation
-    base: tuple[str, ...] = ("base_x", "base_y", "base_heading")
-    linear = False
-    closed_form = None
-
-    def __post_init__(self) -> None:
-        # A parametrisation to fit, without joints of its own that are cyclic.
-        fitted = isinstance(self.arm, Parametrisation) and not isinstance(self.arm, type)
-        if not fitted or self.arm.closed_form is not None or isinstance(self.arm, Mobile):
-            raise InvalidValueError("arm", repr(self.arm)[:80], "a parametrisation to fit, such as Polynomial(2)")
-        if getattr(self.arm, "cyclic", ()):
-            raise InvalidValueError("arm", self.arm.label, "a parametrisation without cyclic joints")
-        # Three joints of the base, by their names.
-        names = tuple(self.base) if isinstance(self.base, tuple | list) else ()
-        if len({*names}) != RULES.on_plane or not all(isinstance(name, str) for name in names):
-            raise InvalidValueError("base", repr(self.base)[:80], "names of three joints: x, y and the heading")
-        object.__setattr__(self, "base", names)
-
-    @property
-    def label(self) -> str:
-        """'mobile:' and the label of the arm's functions."""
-        return f"mobile:{self.arm.label}"
-
-    def for_problem(self, problem: Problem) -> Mobile:
-        """The parametrisation with functions for this problem.
-
-        Raises:
-            InvalidValueError: if the joints of the base do not slide along x and y and then turn about z.
-        """
-        tree = problem.robot.tree
-        missing = [name for name in self.base if name not in tree.joint_names]
-        if missing:
-            raise InvalidValueError("base", repr(missing[0]), f"joints of {', '.join(tree.joint_names)}")
-        # From the world on: x, y and the heading, each exactly along its axis of the world.
-        R, parent = np.eye(3), -1
-        for name, kind, axis in zip(self.base, ("prismatic", "prismatic", "revolute"), range(3), strict=True):
-            k = tree.joint_names.index(name)
-            R = R @ tree.rotations[k]
-            if tree.joint_kinds[k] != kind or tree.parents[k] != parent or np.abs(R[:, 2] - np.eye(3)[axis]).max() > 0:
-                wanted = "joints that slide along x, then along y, and then turn about z, from the world on"
-                raise InvalidValueError("base", repr(name), wanted)
-            parent = k
-        return Mobile(self.arm.for_problem(problem), self.base)
-
-    def family(self, space: JointSpace, outputs: int) -> MobileFamily:
-        """The family on the given joints.
-
-        Raises:
-            InvalidValueError: if there are less than three coordinates, or joints of the base are missing.
-        """
-        if outputs < RULES.on_plane:
-            raise InvalidValueError("extra coordinates of a mobile base", outputs, f"at least {RULES.on_plane}")
-        for name in self.base:
-            if name not in space.joint_names:
-                raise InvalidValueError(f"joint '{name}' of the base", "an idle joint", "one that moves the task")
-        places = tuple(space.joint_names.index(name) for name in self.base)
-        joints = tuple(i for i in range(space.n) if i not in places)
-        return MobileFamily(self.arm.family(space.restricted_to(list(joints)), outputs), places, joints)
-
-
-@dataclass(frozen=True, eq=False)
-class MobileFamily:
-    """The coordinates of `Mobile`. theta holds the parameters of f, then b_1, b_2, then c_4..c_r."""
-
-    arm: Family
-    places: tuple[int, ...]  #: of the base's joints
-    joints: tuple[int, ...]  #: of the arm
-
-    @property
-    def outputs(self) -> int:
-        """Number r of components."""
-        return self.arm.outputs
-
-    @property
-    def size(self) -> int:
-        """Number of parameters."""
-        return self.arm.size + 2 + self.outputs - RULES.on_plane
-
-    @property
-    def as_matrices(self) -> bool:
-        """What the functions of the arm say."""
-        return self.arm.as_matrices
-
-    @property
-    def width(self) -> int:
-        """What the functions of the arm say."""
-        return self.arm.width
-
-    def expression(self, q: Expression, theta: Expression) -> Expression:
-        """xi, (r, N), for q (n, N)."""
-        # The arm's coordinates, the first two of them in the axes of the base.
-        own, rest = theta[: self.arm.size], theta[self.arm.size :]
-        f = self.arm.expression(q[list(self.joints), :], own)
-        x, y, heading = (q[i, :] for i in self.places)
-        ahead, aside = f[0, :] + rest[0], f[1, :] + rest[1]
-        # Turned by the heading and shifted by the place, they are those of the world.
-        c, s = ca.cos(heading), ca.sin(heading)
-        rows = [x + c * ahead - s * aside, y + s * ahead + c * aside, heading + f[2, :]]
-        rows += [rest[k - 1] * heading + f[k, :] for k in range(RULES.on_plane, self.outputs)]
-        xi: Expression = ca.vertcat(*rows)
-        return xi
-
-    def jacobian(self, q: Expression, theta: Expression) -> list[Expression]:
-        """Gradients, r matrices (n, N)."""
-        return component_gradients(self.expression(q, theta), q)
-
-    def initial(self, seed: int) -> Array:
-        """Nearly the place and the heading of the base, (size,).
-
-        With larger f_1 and f_2, a fit can let them grow without end, so that (xi_1, xi_2) leaves the place out.
-        """
-        return np.concatenate([RULES.start * self.arm.initial(seed), np.zeros(self.size - self.arm.size)])
 
 
 def anywhere(problem: Problem, base: tuple[str, ...]) -> Problem:

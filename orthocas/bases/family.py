@@ -1,17 +1,20 @@
-"""Interfaces of parametrisations xi_theta(q): families by what they can do, and bases of functions."""
+"""Parametrisations xi_theta(q): families by what they can do, bases of functions, joints in labels, the registry."""
 
-from collections.abc import Callable, Iterator, Sequence
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Any, Protocol, Self, TypeVar, runtime_checkable
+from dataclasses import asdict, dataclass, fields, is_dataclass
+from typing import TYPE_CHECKING, Any, Literal, Protocol, Self, TypeVar, runtime_checkable
 
 import casadi as ca
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
-from orthocas.errors import InvalidValueError
+from orthocas.errors import InvalidValueError, NotSavableWarning, warn_caller
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array, require_shape
+from orthocas.tools.checks import Array, require_kind, require_known, require_shape
 
 if TYPE_CHECKING:
     from orthocas.tasks.problem import Problem
@@ -68,7 +71,7 @@ class JointSpace:
     joint_names: tuple[str, ...]
 
     @classmethod
-    def of(cls, problem: "Problem") -> "JointSpace":
+    def of(cls, problem: Problem) -> JointSpace:
         """All joints of a problem."""
         robot, domain = problem.robot, problem.domain
         return cls(domain.centre, domain.half_width, robot.tree.prismatic, robot.joint_names)
@@ -78,7 +81,7 @@ class JointSpace:
         """Number of joints."""
         return len(self.centre)
 
-    def restricted_to(self, joints: list[int]) -> "JointSpace":
+    def restricted_to(self, joints: list[int]) -> JointSpace:
         """The space of some of the joints."""
         return JointSpace(
             self.centre[joints],
@@ -210,10 +213,10 @@ class Parametrisation(Protocol):
         """Whether its families are linear in their parameters. Then `fit` minimises by Gauss-Newton or QuasiNewton."""
 
     @property
-    def closed_form(self) -> "Callable[[Problem], ClosedForm] | None":
+    def closed_form(self) -> Callable[[Problem], ClosedForm] | None:
         """The function that gives the parameters without a fit, or None if they are fitted."""
 
-    def for_problem(self, problem: "Problem") -> "Parametrisation":
+    def for_problem(self, problem: Problem) -> Parametrisation:
         """The parametrisation for this problem. It is the object itself if it does not depend on the problem."""
 
     def family(self, space: JointSpace, outputs: int) -> Family:
@@ -327,3 +330,198 @@ class BasisFamily:
     def combined(self, theta: Array, B: Array) -> Array:
         """Coefficients of B xi, (size,), for a matrix B (r, r)."""
         return np.asarray((B @ theta.reshape(self.outputs, self.width)).ravel())
+
+
+Cyclic = tuple[str, ...] | Literal["auto"]  #: names of joints; "auto" for all cyclic joints of the problem
+_CYCLIC, _WITHOUT = "cyclic", "without"  # words of labels
+
+
+def check_joint_names(cyclic: Any, without: Any) -> tuple[Cyclic, tuple[str, ...]]:
+    """Names of joints that enter linearly, or "auto", and of joints that coordinates do not depend on.
+
+    Raises:
+        InvalidValueError: if a name appears twice, or one is in both.
+    """
+
+    def are_different(names: Any) -> bool:
+        return (
+            isinstance(names, list | tuple)
+            and all(isinstance(name, str) for name in names)
+            and len(set(names)) == len(names)
+        )
+
+    auto = isinstance(cyclic, str) and cyclic == "auto"
+    if not auto and not are_different(cyclic):
+        raise InvalidValueError("cyclic", repr(cyclic)[:80], "a list of different joint names, or 'auto'")
+    if not are_different(without) or (not auto and set(without) & set(cyclic)):
+        raise InvalidValueError("without", repr(without)[:80], "a list of different joint names, none of them cyclic")
+    return "auto" if auto else tuple(cyclic), tuple(without)
+
+
+def suffix(cyclic: Cyclic, without: tuple[str, ...] = ()) -> str:
+    """What a label adds: ':cyclic' for "auto", ':cyclic=NAME,NAME', and ':without=NAME,NAME'."""
+    linear = "" if not cyclic else f":{_CYCLIC}" if cyclic == "auto" else f":{_CYCLIC}={','.join(cyclic)}"
+    return linear + (f":{_WITHOUT}={','.join(without)}" if without else "")
+
+
+def parse_suffix(text: str, before: str) -> tuple[Cyclic, tuple[str, ...]]:
+    """Parse what ends a label: '', 'cyclic' or 'cyclic=NAME,NAME', then 'without=NAME,NAME'.
+
+    Args:
+        text: the end of the label.
+        before: what may stand before it, for messages.
+    """
+    cyclic: Cyclic = ()
+    without: tuple[str, ...] = ()
+    for part in text.split(":") if text else ():
+        # each part is a word, with names behind it
+        word, equals, names = part.partition("=")
+        if word not in (_CYCLIC, _WITHOUT) or (not names if equals else word == _WITHOUT):
+            wanted = f"{before}, then 'cyclic' or 'cyclic=JOINT,JOINT', then 'without=JOINT'"
+            raise InvalidValueError("parametrisation", repr(text), wanted)
+        if word == _CYCLIC:
+            cyclic = tuple(names.split(",")) if equals else "auto"
+        else:
+            without = tuple(names.split(","))
+    return cyclic, without
+
+
+def indices(cyclic: Cyclic, space: JointSpace) -> list[int]:
+    """The cyclic joints of a space, in order.
+
+    Raises:
+        InvalidValueError: if a name is not among the joints, or "auto" has not been resolved.
+    """
+    if cyclic == "auto":
+        raise InvalidValueError("cyclic", "'auto'", "joint names: for_problem(problem) finds them")
+    for name in cyclic:
+        if name not in space.joint_names:
+            raise InvalidValueError("cyclic", repr(name), f"joints of {', '.join(space.joint_names)}")
+    return [k for k, name in enumerate(space.joint_names) if name in cyclic]
+
+
+@dataclass(frozen=True)
+class Registration:
+    """A parametrisation that chart files and the command line support."""
+
+    kind: type[Parametrisation]
+    parse: Callable[[str], Parametrisation] | None  #: parses the text after 'name:' on the command line
+
+
+_REGISTERED: dict[str, Registration] = {}
+
+
+def register_parametrisation(
+    name: str, kind: type[Parametrisation], parse: Callable[[str], Parametrisation] | None = None
+) -> None:
+    """Register a parametrisation, so that its charts can be saved and loaded, and the command line accepts it.
+
+    A program that loads such a chart file must register the same name first.
+
+    Args:
+        name: unique name. Labels begin with it.
+        kind: a dataclass that is built from its fields. They are plain data: numbers, text, or tuples of them.
+        parse: converts the text after the colon in 'name:text' to a parametrisation. Without it, the command line does
+            not accept the name.
+
+    Raises:
+        InvalidValueError: if the name belongs to another class, or the class is not a dataclass.
+
+    Example:
+        >>> from dataclasses import dataclass
+        >>> import orthocas as oc
+        >>> from orthocas import bases
+        >>> @dataclass(frozen=True)
+        ... class Cubic(oc.Polynomial):
+        ...     degree: int = 3
+        >>> oc.register_parametrisation("cubic", Cubic, parse=lambda text: Cubic())
+        >>> bases.parse_parametrisation("cubic")
+        Cubic(degree=3, cyclic=(), joints=None, without=())
+    """
+    require_kind("name", name, str)
+    before = _REGISTERED.get(name)
+    if before is not None and before.kind is not kind:
+        raise InvalidValueError("name", repr(name), f"a name that {before.kind.__name__} does not use")
+    if not isinstance(kind, type) or not is_dataclass(kind):
+        raise InvalidValueError("kind", repr(kind), "a dataclass: chart files store its fields")
+    _REGISTERED[name] = Registration(kind, parse)
+
+
+def parametrisation_names() -> tuple[str, ...]:
+    """Names that the command line accepts."""
+    return tuple(name for name, each in _REGISTERED.items() if each.parse is not None)
+
+
+def warn_unless_savable(parametrisation: Parametrisation) -> None:
+    """Issue a NotSavableWarning, before a fit, if its chart cannot be saved."""
+    try:
+        parametrisation_to_data(parametrisation)
+    except InvalidValueError as error:
+        warn_caller(f"charts of this fit cannot be saved: {error}", NotSavableWarning)
+
+
+def parametrisation_to_data(parametrisation: Parametrisation) -> dict[str, Any]:
+    """Convert a parametrisation to plain data: kind and settings.
+
+    A setting that came later may have the metadata {"stored": "if given"}: data leave it out while it is None or empty,
+    so that charts of before keep their fingerprints.
+
+    Raises:
+        InvalidValueError: if it is not registered, or its settings are not plain data.
+    """
+    kind = type(parametrisation)
+    if kind not in {each.kind for each in _REGISTERED.values()} or not is_dataclass(parametrisation):
+        raise InvalidValueError(
+            "parametrisation",
+            kind.__name__,
+            f"a registered one, so that it can be saved: orthocas.register_parametrisation('...', {kind.__name__})",
+        )
+    # Settings that are parametrisations become data themselves.
+    parts = {part.name: getattr(parametrisation, part.name) for part in fields(parametrisation)}
+    inner = {name: parametrisation_to_data(part) for name, part in parts.items() if isinstance(part, Parametrisation)}
+    settings = {**asdict(parametrisation), **inner}
+    for part in fields(parametrisation):
+        if part.metadata.get("stored") == "if given" and parts[part.name] in (None, ()):
+            del settings[part.name]
+    try:
+        json.dumps(settings)
+    except (TypeError, ValueError) as error:
+        raise InvalidValueError(f"settings of {kind.__name__}", f"not plain data ({error})", "plain data") from None
+    return {"parametrisation": kind.__name__, "settings": settings}
+
+
+def parametrisation_from_data(data: Mapping[str, Any]) -> Parametrisation:
+    """Convert the result of `parametrisation_to_data` back.
+
+    Raises:
+        UnknownNameError: if no such parametrisation is registered.
+    """
+    require_kind("data of a parametrisation", data, Mapping)
+    kinds = {each.kind.__name__: each.kind for each in _REGISTERED.values()}
+    name: str = data.get("parametrisation", "")
+    settings: Any = data.get("settings")
+    require_known("parametrisation", name, kinds)
+    kind = kinds[name]
+    require_kind("settings", settings, dict)
+    names = {field.name for field in fields(kind)}  # type: ignore[arg-type]
+    # Settings that are parametrisations themselves.
+    inner = {name: part for name, part in settings.items() if isinstance(part, dict) and "parametrisation" in part}
+    settings = settings | {name: parametrisation_from_data(part) for name, part in inner.items()}
+    if not settings.keys() <= names:
+        raise InvalidValueError(f"settings of {kind.__name__}", sorted(settings), f"some of {sorted(names)}")
+    return kind(**settings)
+
+
+def parse_parametrisation(label: str) -> Parametrisation:
+    """Parse a label: 'polynomial:4:joints=2', 'fourier:2:cyclic', 'mlp:64x64:raw', 'circle:mlp:32x32', 'linear', yours.
+
+    Raises:
+        UnknownNameError: if there is no such parametrisation.
+        InvalidValueError: if the text after the colon is invalid.
+    """
+    require_kind("parametrisation", label, str)
+    name, _, text = label.partition(":")
+    require_known("parametrisation", name, parametrisation_names())
+    parse = _REGISTERED[name].parse
+    assert parse is not None
+    return parse(text)

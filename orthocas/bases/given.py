@@ -197,8 +197,20 @@ def sew_angle(robot: Robot, kind: str) -> ca.Function:
             raise RobotError(f"joint '{name}' does not follow joint '{tree.joint_names[i - 1]}', expected a chain")
     q = ca.SX.sym("q", robot.n)
     poses = build_body_poses(tree, q)
-    # Each point lies on a joint's axis, the z of its body, at a fixed height above the body's origin.
-    S, E, W = (poses[k][1] + poses[k][0][:, 2] * height for k, height in _find_points(tree))
+    # Each point lies on a joint's axis, the z of its body, at a height above the body's origin that does not depend on
+    # q, because neighbouring axes are fixed to each other. Where axes 1, 2 and 3 meet, S is fixed in the base and in
+    # bodies 1 to 3, so it is a point of axis 1; where axes 5 and 6 meet, W is one of axis 5.
+    shoulder, on_2, gap_12 = _find_common_normal(tree, 0)
+    also_on_2, _, gap_23 = _find_common_normal(tree, 1)
+    elbow = _find_common_normal(tree, 2)[1]
+    wrist, on_6, gap_56 = _find_common_normal(tree, 4)
+    meets = max(gap_12, gap_23, abs(on_2 - also_on_2)) <= RULES.meeting
+    places = (
+        (0, shoulder) if meets else (1, also_on_2),
+        (3, elbow),
+        (4, wrist) if gap_56 <= RULES.meeting else (5, on_6),
+    )
+    S, E, W = (poses[k][1] + poses[k][0][:, 2] * height for k, height in places)
     e_t, e_r = (ca.SX(ca.DM(direction)) for direction in DIRECTIONS[kind])
     return dense_function("sew_angle", [q], [compute_elbow_angle(E - S, W - S, e_t, e_r)])
 
@@ -209,21 +221,6 @@ def compute_elbow_angle(p_SE: ca.SX, p_SW: ca.SX, e_t: ca.SX, e_r: ca.SX) -> ca.
     k_r = ca.cross(e_SW - e_t, e_r)
     k_x = ca.cross(k_r, p_SW)
     return ca.atan2(ca.dot(e_SW, ca.cross(k_x, p_SE)), ca.dot(k_x, p_SE))
-
-
-def _find_points(tree: KinematicTree) -> tuple[tuple[int, float], ...]:
-    """S, E and W: an axis, and the height [m] on it above the origin of its body.
-
-    The heights do not depend on q, because neighbouring axes are fixed to each other. Where axes 1, 2 and 3 meet, S is
-    fixed in the base and in bodies 1 to 3, so it is a point of axis 1; where axes 5 and 6 meet, W is one of axis 5.
-    """
-    shoulder, on_2, gap_12 = _find_common_normal(tree, 0)
-    also_on_2, _, gap_23 = _find_common_normal(tree, 1)
-    _, elbow, _ = _find_common_normal(tree, 2)
-    wrist, on_6, gap_56 = _find_common_normal(tree, 4)
-    meets = max(gap_12, gap_23, abs(on_2 - also_on_2)) <= RULES.meeting
-    S = (0, shoulder) if meets else (1, also_on_2)
-    return S, (3, elbow), (4, wrist) if gap_56 <= RULES.meeting else (5, on_6)
 
 
 def _find_common_normal(tree: KinematicTree, i: int) -> tuple[float, float, float]:

@@ -10,9 +10,17 @@ from typing import TYPE_CHECKING
 import casadi as ca
 import numpy as np
 
-from orthocas.bases import cyclic as cyclic_choice
-from orthocas.bases.cyclic import Cyclic
-from orthocas.bases.family import ArrayMemory, Expression, JointSpace, Pulled
+from orthocas.bases.cyclic import resolved
+from orthocas.bases.family import (
+    ArrayMemory,
+    Cyclic,
+    Expression,
+    JointSpace,
+    Pulled,
+    check_joint_names,
+    indices,
+    suffix,
+)
 from orthocas.errors import InvalidValueError
 from orthocas.tools.checks import Array, require_count, require_kind, require_known
 
@@ -190,8 +198,9 @@ class MLP:
             raise InvalidValueError("hidden", self.hidden, "the widths of at least one hidden layer, such as (64, 64)")
         object.__setattr__(self, "hidden", tuple(require_count("hidden", width) for width in self.hidden))
         require_kind("raw", self.raw, bool)
-        object.__setattr__(self, "cyclic", cyclic_choice.check_cyclic(self.cyclic))
-        object.__setattr__(self, "without", cyclic_choice.check_without(self.without, self.cyclic))
+        cyclic, without = check_joint_names(self.cyclic, self.without)
+        object.__setattr__(self, "cyclic", cyclic)
+        object.__setattr__(self, "without", without)
         require_known("activation", self.activation, ACTIVATIONS)
 
     @property
@@ -199,11 +208,11 @@ class MLP:
         """'mlp:WIDTHxWIDTH', ':raw' for raw inputs, ':isru', and the joints that enter in another way."""
         widths = "x".join(map(str, self.hidden)) + (":raw" if self.raw else "")
         widths += "" if self.activation == "tanh" else f":{self.activation}"
-        return f"mlp:{widths}{cyclic_choice.suffix(self.cyclic, self.without)}"
+        return f"mlp:{widths}{suffix(self.cyclic, self.without)}"
 
     def for_problem(self, problem: Problem) -> MLP:
         """The parametrisation with the names of the problem's cyclic joints, if it reduces any."""
-        return replace(self, cyclic=cyclic_choice.resolved(self.cyclic, problem)) if self.cyclic else self
+        return replace(self, cyclic=resolved(self.cyclic, problem)) if self.cyclic else self
 
     def family(self, space: JointSpace, outputs: int) -> MLPFamily:
         """The network on the given joints.
@@ -211,8 +220,8 @@ class MLP:
         Raises:
             InvalidValueError: if no joint enters the network.
         """
-        linear = tuple(cyclic_choice.indices(self.cyclic, space))
-        without = cyclic_choice.indices(self.without, space)
+        linear = tuple(indices(self.cyclic, space))
+        without = indices(self.without, space)
         inputs = tuple(i for i in range(space.n) if i not in (*linear, *without))
         if not inputs:
             raise InvalidValueError("cyclic and without", self.label, "at least one joint that enters the network")

@@ -12,9 +12,8 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from orthocas.bases import cyclic as cyclic_choice
-from orthocas.bases.cyclic import Cyclic
-from orthocas.bases.family import BasisFamily, ClosedForm, JointSpace
+from orthocas.bases.cyclic import resolved
+from orthocas.bases.family import BasisFamily, ClosedForm, Cyclic, JointSpace, check_joint_names, indices, suffix
 from orthocas.errors import InvalidValueError, SingularTaskError
 from orthocas.tasks.problem import Problem
 from orthocas.tools.cached import cached_property
@@ -186,14 +185,15 @@ class Products:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "degree", require_count("degree", self.degree))
-        object.__setattr__(self, "cyclic", cyclic_choice.check_cyclic(self.cyclic))
-        object.__setattr__(self, "without", cyclic_choice.check_without(self.without, self.cyclic))
+        cyclic, without = check_joint_names(self.cyclic, self.without)
+        object.__setattr__(self, "cyclic", cyclic)
+        object.__setattr__(self, "without", without)
         if self.joints is not None:
             object.__setattr__(self, "joints", require_count("joints", self.joints))
 
     def for_problem(self, problem: Problem) -> Self:
         """The parametrisation with the names of the problem's cyclic joints, if it reduces any."""
-        return replace(self, cyclic=cyclic_choice.resolved(self.cyclic, problem)) if self.cyclic else self
+        return replace(self, cyclic=resolved(self.cyclic, problem)) if self.cyclic else self
 
     def of_degree(self, degree: int) -> Self:
         """The same parametrisation with another degree."""
@@ -203,7 +203,7 @@ class Products:
     def _settings(self) -> str:
         """The label after its name: 'DEGREE', with the most joints of a product and the cyclic joints if given."""
         most = "" if self.joints is None else f":{JOINTS}={self.joints}"
-        return f"{self.degree}{most}{cyclic_choice.suffix(self.cyclic, self.without)}"
+        return f"{self.degree}{most}{suffix(self.cyclic, self.without)}"
 
     def _count_terms(self, n: int, functions: int) -> int:
         """Sum over j of C(n, j) C(d, j) f^j without the constant, for f functions of each degree of a joint."""
@@ -267,9 +267,9 @@ class Polynomial(Products):
             return values
 
         # Functions that each joint may bring, and their products up to the degree.
-        none = cyclic_choice.indices(self.without, space)
+        none = indices(self.without, space)
         degrees = [[0] if i in none else list(range(self.degree + 1)) for i in range(space.n)]
-        terms = reduce_terms(degrees, self.degree, cyclic_choice.indices(self.cyclic, space), self.joints)
+        terms = reduce_terms(degrees, self.degree, indices(self.cyclic, space), self.joints)
         return build_product_family(space, outputs, terms, legendre, derivatives)
 
 
@@ -311,7 +311,7 @@ class Fourier(Products):
             raise InvalidValueError(
                 f"joint '{name}' of a Fourier basis", "prismatic", "a revolute joint; use polynomial instead"
             )
-        linear = cyclic_choice.indices(self.cyclic, space)
+        linear = indices(self.cyclic, space)
 
         # Waves of length 1; a cyclic joint has a linear function in place of its first one.
         def waves(q: Any) -> list[Any]:
@@ -329,7 +329,7 @@ class Fourier(Products):
             return D
 
         # Functions that each joint may bring, and their products up to the degree.
-        none = cyclic_choice.indices(self.without, space)
+        none = indices(self.without, space)
         of_joint = [0, *(k for k in range(1, self.degree + 1) for _ in range(2))]
         degrees = [[0] if i in none else of_joint for i in range(space.n)]
         terms = reduce_terms(degrees, self.degree, linear, self.joints)

@@ -23,7 +23,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocas.bases.cyclic import Mobile
+from orthocas.bases.composed import Mobile
 from orthocas.bases.mlp import MLPFamily, split_layers
 from orthocas.bases.products import ProductFamily
 from orthocas.certificates.graph import TaylorGraph

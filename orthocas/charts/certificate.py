@@ -6,7 +6,6 @@ from dataclasses import dataclass, field, replace
 from typing import Any, Self
 
 import numpy as np
-from numpy.typing import NDArray
 
 from orthocas.errors import CertifyError, InvalidValueError
 from orthocas.tools.checks import Array, freeze_array, require_kind, require_shape, require_text
@@ -90,12 +89,23 @@ class Subdivision:
         """Share of the volume that is proved: 1 only if all of it is."""
         if self.complete:
             return 1.0
-        depths = self._compute_depths()[self.codes == PROVED]
-        return min(float((0.5**depths).sum()), 1 - 2**-53)
+        depths, waiting = np.zeros(self.codes.size), [0]
+        for k, code in enumerate(self.codes.tolist()):
+            depths[k] = waiting.pop()
+            if code < PROVED:
+                waiting += [depths[k] + 1] * 2
+        return min(float((0.5 ** depths[self.codes == PROVED]).sum()), 1 - 2**-53)
 
     def leaves(self, code: int) -> tuple[Array, Array]:
         """Corners (boxes, n) of the parts with a code, in preorder."""
-        upper, parts = self._find_upper_halves(), []
+        # where the upper half of each part that is halved stands; the lower half follows it
+        upper, waiting = np.zeros(self.codes.size, dtype=np.intp), list[int]()
+        for k, number in enumerate(self.codes.tolist()):
+            if number < PROVED:
+                waiting.append(k)
+            elif waiting:
+                upper[waiting.pop()] = k + 1
+        parts = []
         place, low, high = np.zeros(1, dtype=int), self.low[None], self.high[None]
         # One level of the tree at a time.
         while place.size:
@@ -111,26 +121,6 @@ class Subdivision:
         places, lows, highs = (np.concatenate(each) for each in zip(*parts, strict=True))
         order = np.argsort(places)
         return lows[order], highs[order]
-
-    def _find_upper_halves(self) -> NDArray[np.intp]:
-        """Where the upper half of each part that is halved stands; the lower half follows it."""
-        places = np.zeros(self.codes.size, dtype=np.intp)
-        waiting: list[int] = []
-        for k, code in enumerate(self.codes.tolist()):
-            if code < PROVED:
-                waiting.append(k)
-            elif waiting:
-                places[waiting.pop()] = k + 1
-        return places
-
-    def _compute_depths(self) -> Array:
-        depths = np.zeros(self.codes.size)
-        waiting = [0]
-        for k, code in enumerate(self.codes.tolist()):
-            depths[k] = waiting.pop()
-            if code < PROVED:
-                waiting += [depths[k] + 1] * 2
-        return depths
 
 
 def halve_interval(low: Any, high: Any) -> Any:

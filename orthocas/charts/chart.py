@@ -13,8 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.charts.certificate import Certificate
-from orthocas.charts.clearance import Clearance
-from orthocas.charts.coordinates import CoordinateMap
+from orthocas.charts.coordinates import CoordinateMap, fill_coordinates
 from orthocas.charts.inverse import (
     Solutions,
     build_phi,
@@ -26,10 +25,10 @@ from orthocas.charts.inverse import (
     solve_rows,
 )
 from orthocas.charts.parts import FUNCTIONS, ChartParts
-from orthocas.charts.phi import fill_coordinates
 from orthocas.charts.point_quality import PointQuality, point_quality
 from orthocas.charts.self_motion import SelfMotion, XiRange, self_motion, xi_range
 from orthocas.charts.trackers import ReachingTracker, Tracker
+from orthocas.charts.walls import Clearance, require_collisions
 from orthocas.errors import InvalidValueError
 from orthocas.robots.collisions import Collisions
 from orthocas.robots.robot import Robot
@@ -110,17 +109,17 @@ class Chart(Shown):
         """Where the chart is meant to be used."""
         return self.problem.domain
 
-    @property
+    @cached_property
     def n(self) -> int:
         """Number of joints."""
         return self.problem.n
 
-    @property
+    @cached_property
     def m(self) -> int:
         """Number of task components."""
         return self.problem.m
 
-    @property
+    @cached_property
     def r(self) -> int:
         """Number of extra coordinates."""
         return self.problem.r
@@ -275,8 +274,7 @@ class Chart(Shown):
         """
         phi = build_phi(self, phi, x, xi)
         if collisions is not None:
-            require_kind("collisions", collisions, Collisions)
-            collisions.require_for(self.problem.robot.tree)
+            require_collisions(collisions, self.problem.robot.tree)
         require_kind("all", all, bool)
         # all solutions of one phi
         if all:
@@ -565,9 +563,7 @@ class Chart(Shown):
         """
         from orthocas.charts.chart_file import write_chart  # all that files may hold, which a fit does not need
 
-        if collisions is not None:
-            require_kind("collisions", collisions, Collisions)
-            collisions.require_for(self.problem.robot.tree)
+        require_collisions(collisions, self.problem.robot.tree)
         target = as_path("path", path)
         write_chart(target, self.problem, self.coordinates, self.notes, self.certificate, force, collisions)
 

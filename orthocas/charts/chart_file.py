@@ -9,17 +9,16 @@ from typing import Any
 import numpy as np
 
 from orthocas.bases.cyclic import require_cyclic
-from orthocas.bases.family import CyclicParametrisation, JointSpace
+from orthocas.bases.family import CyclicParametrisation, JointSpace, parametrisation_from_data, parametrisation_to_data
 from orthocas.bases.mlp import MLP
 from orthocas.bases.products import Fourier, Linear, Polynomial
-from orthocas.bases.registry import parametrisation_from_data, parametrisation_to_data
 from orthocas.charts.certificate import Certificate, Subdivision
 from orthocas.charts.coordinates import CoordinateMap, Coordinates
 from orthocas.charts.regular_part import RegularPart
 from orthocas.errors import CertifyError, ChartFileError, InvalidValueError, OrthocasError
 from orthocas.exact.flow import GrownCoordinates
 from orthocas.exact.leaves import read_leaf
-from orthocas.robots.collision_data import KnownSolids, collisions_from_data, collisions_to_data
+from orthocas.robots.collision_files import KnownSolids, collisions_from_data, collisions_to_data
 from orthocas.robots.collisions import Collisions
 from orthocas.tasks.problem import FOREIGN, Problem, read_problem, write_problem
 from orthocas.tasks.samples import sample_uniform
@@ -46,18 +45,12 @@ def certificate_to_data(certificate: Certificate) -> tuple[dict[str, Any], dict[
         tree: Subdivision | None = getattr(certificate, name)
         if tree is not None:
             arrays |= {f"certificate_{name}_{corner}": getattr(tree, corner) for corner in _CORNERS}
-    header = {
-        "fingerprint": certificate.fingerprint,
-        "method": certificate.method,
-        "bound": certificate.bound,
-        "conditioning": certificate.conditioning,
-        "fold": [list(point) for point in certificate.fold],
-        "boxes": certificate.boxes,
-        "seconds": certificate.seconds,
-        **({"least_singular_value": certificate.least_singular_value} if certificate.least_singular_value else {}),
-        **({name: getattr(certificate, name) for name in _GUARDED} if certificate.least_volume else {}),
-        **({"digest": certificate.digest} if certificate.digest else {}),
-    }
+    names = ["fingerprint", "method", "bound", "conditioning", "fold", "boxes", "seconds"]
+    names += ["least_singular_value"] if certificate.least_singular_value else []
+    names += _GUARDED if certificate.least_volume else ()
+    names += ["digest"] if certificate.digest else []
+    header: dict[str, Any] = {name: getattr(certificate, name) for name in names}
+    header["fold"] = [list(point) for point in certificate.fold]
     return header, arrays
 
 
@@ -87,7 +80,7 @@ def certificate_from_data(data: Mapping[str, Any], arrays: Mapping[str, Stored],
         _number(data, "least_singular_value") if "least_singular_value" in data else 0.0,
         _number(data, "least_volume") if "least_volume" in data else 0.0,
         _number(data, "clear_share") if "clear_share" in data else 0.0,
-        get_part(data, "digest", str) if "digest" in data else "",  # missing in older files
+        get_part(data, "digest", str) if "digest" in data else "",
     )
     # older files count boxes that were given up
     if "dead" not in data:
@@ -156,7 +149,14 @@ def fingerprint(problem: Problem, coordinates: CoordinateMap) -> str:
 def _content(problem: Problem, coordinates: CoordinateMap) -> tuple[dict[str, Any], dict[str, Stored]]:
     """Header and arrays of a chart, without notes."""
     header, arrays = write_problem(problem)
-    description, numbers = _coordinates_to_data(coordinates)
+    description: dict[str, Any]
+    if isinstance(coordinates, GrownCoordinates):
+        description = {"leaf": coordinates.leaf.kind}
+        numbers = {f"{_LEAF}{name}": array for name, array in coordinates.leaf.to_arrays().items()}
+    else:
+        assert isinstance(coordinates, Coordinates)
+        description = {**parametrisation_to_data(coordinates.parametrisation), "idle": list(coordinates.idle)}
+        numbers = {name: getattr(coordinates, name) for name in ("theta", "offset", "scale")}
     return {**header, "coordinates": description}, {**arrays, **numbers}
 
 
@@ -193,7 +193,14 @@ def read_chart(path: str | Path) -> tuple[Problem, CoordinateMap, Notes, Certifi
             solids = collisions_from_data(problem.robot.tree, get_part(header, "collisions", dict), arrays)
             problem.robot.solids = KnownSolids(solids)
         # a proof of other coordinates is refused
-        certificate = _certificate(problem, coordinates, header, arrays)
+        certificate = None
+        if "certificate" in header:
+            proof = get_part(header, "certificate", dict)
+            certificate = certificate_from_data(proof, arrays, problem.n)
+            certificate.require_for(fingerprint(problem, coordinates))
+            # notes are missing in older files
+            if "notes" in proof and proof["notes"] != _digest_of(header["notes"]):
+                raise CertifyError("the notes have been changed since the file was written")
         return problem, coordinates, _checked_notes(get_part(header, "notes", dict)), certificate
     except ChartFileError:
         raise
@@ -201,21 +208,6 @@ def read_chart(path: str | Path) -> tuple[Problem, CoordinateMap, Notes, Certifi
         raise ChartFileError(f"{path} is inconsistent: {error}") from None
     except FOREIGN as error:
         raise ChartFileError(f"{path} is incomplete: {type(error).__name__} {error}") from None
-
-
-def _certificate(
-    problem: Problem, coordinates: CoordinateMap, header: Mapping[str, Any], arrays: Mapping[str, Stored]
-) -> Certificate | None:
-    """The certificate of the file, if it has one, and only if it belongs to the chart."""
-    if "certificate" not in header:
-        return None
-    data = get_part(header, "certificate", dict)
-    certificate = certificate_from_data(data, arrays, problem.n)
-    certificate.require_for(fingerprint(problem, coordinates))
-    # missing in older files
-    if "notes" in data and data["notes"] != _digest_of(header["notes"]):
-        raise CertifyError("the notes have been changed since the file was written")
-    return certificate
 
 
 def _digest_of(notes: Mapping[str, Any]) -> str:
@@ -246,30 +238,16 @@ def _require_finite(problem: Problem, coordinates: CoordinateMap) -> None:
     """
     q = sample_uniform(problem.domain, _PROBES, 0)
     values = {"the task": problem.task.batched(q)[0], "the Jacobian of the task": problem.task.batched_jacobian(q)[0]}
-    # grown ones may be NaN
-    if isinstance(coordinates, Coordinates) and not _surely_finite(coordinates):
-        values |= {"xi": coordinates.xi(q), "the Jacobian of xi": coordinates.jacobian(q)}
+    # grown ones may be NaN; others are finite on their domain where all their numbers are moderate: a quick check
+    if isinstance(coordinates, Coordinates):
+        sizes = [np.abs(numbers) for numbers in (coordinates.theta, coordinates.offset, coordinates.scale)]
+        widths = coordinates.space.half_width
+        moderate = all((size < _MODERATE).all() for size in (*sizes, widths, 1 / widths))
+        if not (moderate and isinstance(coordinates.parametrisation, _BOUNDED)):
+            values |= {"xi": coordinates.xi(q), "the Jacobian of xi": coordinates.jacobian(q)}
     for what, numbers in values.items():
         if not np.isfinite(numbers.reshape(_PROBES, -1)).all(axis=1).any():
             raise InvalidValueError(what, f"not finite at any of {_PROBES} points of the domain", "finite numbers")
-
-
-def _surely_finite(coordinates: Coordinates) -> bool:
-    """Whether coordinates are finite on their domain because all their numbers are moderate. That is a quick check."""
-    sizes = [np.abs(values) for values in (coordinates.theta, coordinates.offset, coordinates.scale)]
-    widths = coordinates.space.half_width
-    moderate = all((size < _MODERATE).all() for size in (*sizes, widths, 1 / widths))
-    return moderate and isinstance(coordinates.parametrisation, _BOUNDED)
-
-
-def _coordinates_to_data(coordinates: CoordinateMap) -> tuple[dict[str, Any], dict[str, Stored]]:
-    """Coordinates as plain data and arrays."""
-    if isinstance(coordinates, GrownCoordinates):
-        arrays = {f"{_LEAF}{name}": array for name, array in coordinates.leaf.to_arrays().items()}
-        return {"leaf": coordinates.leaf.kind}, arrays
-    assert isinstance(coordinates, Coordinates)
-    data = {**parametrisation_to_data(coordinates.parametrisation), "idle": list(coordinates.idle)}
-    return data, {"theta": coordinates.theta, "offset": coordinates.offset, "scale": coordinates.scale}
 
 
 def _idle(joints: list[int], n: int) -> tuple[int, ...]:

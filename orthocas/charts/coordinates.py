@@ -85,7 +85,15 @@ def point_functions(family: Family, theta: Array, n: int) -> dict[str, ca.Functi
     if isinstance(family, SelfDerivativeFamily):
         return _from_tables(family, theta, n)
     if isinstance(family, LinearFamily):
-        return _from_basis(family, theta, n)
+        # xi = C psi, J = C dpsi/dq and C d^2 psi[v, w], with the coefficients C and the basis psi
+        x, a, b = (ca.SX.sym(name, n) for name in ("q", "v", "w"))
+        psi = family.basis(x)
+        basis = ca.Function("basis", [x], [psi])
+        slopes = ca.Function("basis_slopes", [x], [ca.densify(ca.jacobian(psi, x))])
+        bends = ca.Function("basis_bends", [x, a, b], [ca.densify(second_derivative(psi, x, a, b))])
+        C = ca.MX(ca.DM(theta.reshape(family.outputs, family.width)))
+        q, v, w = (ca.MX.sym(name, n) for name in ("q", "v", "w"))
+        return _functions(C @ basis(q), C @ slopes(q), C @ bends(q, v, w), q, v, w)
     kind: Any = ca.MX if family.as_matrices else ca.SX
     q, v, w = (kind.sym(name, n) for name in ("q", "v", "w"))
     # constants, so that weights are not sliced and transposed at every call
@@ -98,18 +106,6 @@ def point_functions(family: Family, theta: Array, n: int) -> dict[str, ca.Functi
 def second_derivative(values: Any, q: Any, v: Any, w: Any) -> Any:
     """(d/ds) J(q + s v) w of an SX or MX expression."""
     return ca.jtimes(ca.jtimes(values, q, w), q, v)
-
-
-def _from_basis(family: LinearFamily, theta: Array, n: int) -> dict[str, ca.Function]:
-    """xi = C psi, J = C dpsi/dq and C d^2 psi[v, w], with the coefficients C and the basis psi."""
-    x, a, b = (ca.SX.sym(name, n) for name in ("q", "v", "w"))
-    psi = family.basis(x)
-    basis = ca.Function("basis", [x], [psi])
-    slopes = ca.Function("basis_slopes", [x], [ca.densify(ca.jacobian(psi, x))])
-    bends = ca.Function("basis_bends", [x, a, b], [ca.densify(second_derivative(psi, x, a, b))])
-    C = ca.MX(ca.DM(theta.reshape(family.outputs, family.width)))
-    q, v, w = (ca.MX.sym(name, n) for name in ("q", "v", "w"))
-    return _functions(C @ basis(q), C @ slopes(q), C @ bends(q, v, w), q, v, w)
 
 
 def _from_tables(family: SelfDerivativeFamily, theta: Array, n: int) -> dict[str, ca.Function]:
@@ -144,21 +140,11 @@ def _functions(xi: Any, jacobian: Any, second: Any, q: Any, v: Any, w: Any) -> d
     }
 
 
-Maker = Callable[[], BlockFunction]
-
-
-def block_function(coordinates: "Coordinates", name: str) -> Maker:
-    """What makes xi or the Jacobian of a self-derivative family on blocks, once for each thread.
-
-    They are functions of q (n, c) that return (r, c), or J_xi row by row, (r n, c).
-    """
-    family = coordinates.family
-    assert isinstance(family, SelfDerivativeFamily)
-    return (_values if name == "xi" else _slopes)(coordinates, family)
+Maker = Callable[[], BlockFunction]  #: makes a function of many joint positions side by side, once for each thread
 
 
 def _values(coordinates: "Coordinates", family: SelfDerivativeFamily) -> Maker:
-    """xi = scale (C psi - offset), and the idle joints."""
+    """What makes xi = scale (C psi - offset), and the idle joints: a function of q (n, c) that returns (r, c)."""
     r, active, idle = family.outputs, coordinates.active, list(coordinates.idle)
     # scale and offset go into the coefficients
     C = coordinates.scale[:, None] * coordinates.theta.reshape(r, -1)
@@ -181,7 +167,7 @@ def _values(coordinates: "Coordinates", family: SelfDerivativeFamily) -> Maker:
 
 
 def _slopes(coordinates: "Coordinates", family: SelfDerivativeFamily) -> Maker:
-    """J_xi = scale C_i psi', where psi' holds the basis functions that occur in derivatives, and 1 for idle joints."""
+    """The same for J_xi row by row, (r n, c): scale C_i psi', psi' as in `_from_tables`, and 1 for idle joints."""
     n, r, active = coordinates.space.n, family.outputs, coordinates.active
     by_joint = family.derivative_tables(coordinates.theta)  # (active, r, 1 + K)
     # one table for all joints, with scales and only the functions that occur
@@ -331,11 +317,7 @@ class Coordinates:
             xi.append(q[idle] - ca.DM(self.space.centre[idle]))
             J.append(ca.MX(ca.DM(unit[idle])))
             second.append(ca.MX(len(idle), 1))
-        return {
-            "xi": dense_function("xi", [q], [ca.vertcat(*xi)]),
-            "jacobian": dense_function("J_xi", [q], [ca.vertcat(*J)]),
-            "second_derivative": dense_function("d2xi", [q, v, w], [ca.vertcat(*second)], ["q", "v", "w"]),
-        }
+        return _functions(ca.vertcat(*xi), ca.vertcat(*J), ca.vertcat(*second), q, v, w)
 
     @cached_property
     def _point_by_point(self) -> BuiltOnUse[str, BlockedFunction]:
@@ -352,7 +334,9 @@ class Coordinates:
         """What makes functions of many joint positions side by side."""
         if self.as_matrices:
             return BuiltOnUse(lambda name: self._column_graphs[name].build_block_function)
-        return BuiltOnUse(lambda name: block_function(self, name))
+        family = self.family
+        assert isinstance(family, SelfDerivativeFamily)
+        return BuiltOnUse(lambda name: (_values if name == "xi" else _slopes)(self, family))
 
     @cached_property
     def _column_graphs(self) -> dict[str, NumpyGraph]:
@@ -372,3 +356,11 @@ class Coordinates:
 
 def _columns(values: Sequence[float] | Array, columns: int) -> ca.DM:
     return ca.DM(np.repeat(np.asarray(values, dtype=float)[:, None], columns, axis=1))
+
+
+def fill_coordinates(coordinates: CoordinateMap, name: str, results: Array, points: Array) -> None:
+    """Write xi or its Jacobian, by name, at points (N, n) to part of an array."""
+    if isinstance(coordinates, Coordinates):
+        coordinates.into(name, results, points)
+    else:
+        results[...] = getattr(coordinates, name)(points)

@@ -1,19 +1,40 @@
-"""The self-motion curves of many task values at once, whatever the limits: ways to x, and the curves there."""
+"""Self-motion curves of charts, r = 1: traced for many task values at once, and followed and searched in C.
 
-from dataclasses import dataclass
+`CurveTracer` finds curves whatever the limits. `MotionKernel` follows the self-motion within the domain in C, and
+`SearchKernel` does in C what `curves.SelfMotionCurves` does.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
+from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.descent import BoxedPhi
 from orthocas.charts.newton import inverses
+from orthocas.errors import CompileError, InvalidValueError
+from orthocas.native import curves
+from orthocas.native.kernels import generate_kernels
+from orthocas.native.libraries import keep_library, load_library, pointer
+from orthocas.native.rendering import get_source, render
 from orthocas.tasks.relative import Relative
-from orthocas.tools.batch import dense_function
+from orthocas.tools.batch import dense_function, run_in_threads
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, Indices
 from orthocas.tools.columns import BlockedFunction
 from orthocas.tools.expressions import wrap_shortest
+
+if TYPE_CHECKING:
+    from orthocas.charts.chart import Chart
+
+# -O3 takes twice as long, and gains a tenth.
+_FLAGS = ("-O1",)
 
 
 @dataclass(frozen=True, slots=True)
@@ -58,7 +79,7 @@ class Traces:
     tangent: Array  #: unit tangents there, (K, P, n)
     count: Indices  #: points of each curve, (K,)
 
-    def part(self, curves: Indices) -> "Traces":
+    def part(self, curves: Indices) -> Traces:
         """Some of the curves."""
         row, q, tangent, count = (array[curves] for array in vars(self).values())
         longest = count.max(initial=1)
@@ -163,6 +184,7 @@ class CurveTracer:
         # what `_step` takes for each curve: where it is, tangent, bend, length of the step, and where it began
         state = np.concatenate([q0, t0, np.zeros((K, n)), np.full((K, 1), RULES.step / 2), q0, t0], axis=1)
         left, before = np.arange(K), np.zeros(K)
+        (low, high), room = self.boxed.domain.bounds, RULES.prismatic * self.boxed.domain.half_width
         for _ in range(RULES.most):
             found = self._step(state, x)[0]
             # a step counts if it hits the curve and hardly turns
@@ -181,7 +203,10 @@ class CurveTracer:
             # lengths follow success
             longer = np.where(turned > RULES.straight, np.minimum(1.6 * h, RULES.step), h)
             h[:] = np.where(good, longer, h / 2)
-            goes_on = ~around & (h > RULES.shortest) & self._slides_near(state[:, :n])
+            goes_on = ~around & (h > RULES.shortest)
+            # sliding joints in their ranges, or not far outside
+            if not self.turning.all():
+                goes_on &= (((state[:, :n] >= low - room) & (state[:, :n] <= high + room)) | self.turning).all(axis=1)
             if not goes_on.all():
                 state, x, left, before = state[goes_on], x[goes_on], left[goes_on], before[goes_on]
             if not left.size:
@@ -190,14 +215,6 @@ class CurveTracer:
         last = np.minimum(np.arange(count.max()), count[:, None] - 1)[:, :, None]
         points, tangents = (np.take_along_axis(part, last, axis=1) for part in (points, tangents))
         return points, tangents, count, closed
-
-    def _slides_near(self, q: Array) -> NDArray[np.bool_]:
-        """Whether sliding joints are in their ranges, or not far outside."""
-        if self.turning.all():
-            return np.ones(len(q), dtype=bool)
-        low, high = self.boxed.domain.bounds
-        room = RULES.prismatic * self.boxed.domain.half_width
-        return np.asarray((((q >= low - room) & (q <= high + room)) | self.turning).all(axis=1))
 
     def _on_circles(self, q: Array) -> Array:
         """Cosines and sines of revolute joints, and positions of the others: near one another where q (..., n) is."""
@@ -284,3 +301,175 @@ def solutions_of(A: Array, right: Array) -> Array:
     except np.linalg.LinAlgError:
         found = inverses(A)[0] @ right
     return found
+
+
+@dataclass(frozen=True, slots=True)
+class MotionKernelRules:
+    """Numbers of the way."""
+
+    points: int = 30_000  #: of a way, at most: with more, Python follows it
+    nodes: int = 4000  #: of the curve, after which it counts as endless
+    divided: float = 0.95  #: parts of a step between two points, of the spacing that is wanted
+    rounding: float = 2e-12  #: of the place of a boundary on a step [rad] or [m]
+    piece: int = 64  #: rows that a thread takes at once
+
+
+MOTION = MotionKernelRules()
+ENDLESS, SINGULAR, WALL, FOLD = range(4)  #: what ends a way, as in templates/chart_motion.c.jinja
+
+
+@dataclass(frozen=True, eq=False)
+class MotionKernel:
+    """Follows self-motions of a chart in C, with `runtime/self_motion.c`. Threads may share it."""
+
+    chart: Chart
+
+    def follow(
+        self, q: Array, x: Array, direction: int, folds: bool, spacing: float
+    ) -> tuple[Array, Array, Array, int, Array] | None:
+        """The way from q (n,) inside along which xi rises, 1, or falls, -1; None if it has too many points.
+
+        Args:
+            q: the start.
+            x: its task value, (m,).
+            direction: 1 or -1.
+            folds: whether it ends where xi turns back.
+            spacing: of points [rad] or [m], at most.
+
+        Returns:
+            Points (N, n), the start first, their xi (N,), the length of the way up to each (N,), what ends it, and a
+            point just beyond that (n,), where it is a wall or a fold.
+        """
+        n, most = len(q), MOTION.points
+        # Memory that nothing writes to costs nothing.
+        room, points = np.empty(MOTION.nodes * (2 * n + 1)), np.empty((most, n))
+        xi, length, beyond = np.empty(most), np.empty(most), np.full(n, np.nan)
+        stop = ctypes.c_int()
+        count = self._c.follow_inside(
+            *(pointer(q), pointer(x), direction, int(folds), ctypes.c_double(spacing), pointer(room), MOTION.nodes),
+            *(pointer(points), pointer(xi), pointer(length), most, pointer(beyond), ctypes.byref(stop)),
+        )
+        if not count:
+            return None
+        return points[:count].copy(), xi[:count].copy(), length[:count].copy(), stop.value, beyond
+
+    @cached_property
+    def _c(self) -> Any:
+        values = {"divided": MOTION.divided, "rounding": MOTION.rounding, "rules": asdict(curves.RULES)}
+        sources = ("self_motion.c", "curve_math.c")
+        return _load("chart", "chart_motion.c", _write_chart(self.chart) | values, sources, None)
+
+
+@dataclass(frozen=True, eq=False)
+class SearchKernel:
+    """Searches the self-motion curves of many task values of a chart in C, with `runtime/curve_rows.c`.
+
+    Threads may share it.
+    """
+
+    chart: Chart
+    folder: Path | None = None  #: where its library is kept; None: as `keep_library`
+
+    def search(self, targets: Array, starts: Array, first: int, tolerance: float) -> tuple[Array, Array, Any]:
+        """As `SelfMotionCurves.search`, for starts (N, S, n); those after the `first` ones serve unsolved rows.
+
+        Returns:
+            Points (N, n), their distances (N,), and whether they are neither solutions nor ends of arcs, (N,).
+        """
+        count = len(targets)
+        q, distance, between = np.empty(targets.shape), np.empty(count), np.empty(count, dtype=np.bool_)
+        inputs = np.ascontiguousarray(targets), np.ascontiguousarray(starts)
+        most, room = starts.shape[1], self._c.curve_room()
+
+        def search_piece(begin: int) -> None:
+            rows = slice(begin, begin + MOTION.piece)
+            phi, own, *found = (pointer(part[rows]) for part in (*inputs, q, distance, between))
+            memory = np.empty(room, dtype=np.uint8)
+            sizes = ctypes.c_long(first), ctypes.c_long(most), ctypes.c_double(tolerance)
+            self._c.curve_rows(
+                ctypes.c_long(min(MOTION.piece, count - begin)), phi, own, *sizes, pointer(memory), *found
+            )
+
+        run_in_threads(search_piece, range(0, count, MOTION.piece))
+        return q, distance, between
+
+    def trace(self, target: Array, starts: Array) -> list[tuple[Array, Array]]:
+        """Points (P, n) and unit tangents of each curve of a target to which starts (S, n) lead."""
+        n, nodes, used = self.chart.n, np.empty((curves.RULES.nodes, 2 * self.chart.n + 1)), ctypes.c_int()
+        ends, closed = (np.zeros(curves.RULES.curves, dtype=np.intc) for _ in range(2))
+        first = np.ascontiguousarray(starts)
+        count = self._c.find_curves(
+            *(pointer(np.ascontiguousarray(target)), pointer(first), len(first), len(first)),
+            *(pointer(nodes), len(nodes), pointer(ends), pointer(closed), ctypes.byref(used)),
+        )
+        parts = np.split(nodes[: ends[count - 1]], ends[: count - 1]) if count else []
+        return [(part[:, :n], part[:, n : 2 * n]) for part in parts]
+
+    @cached_property
+    def _c(self) -> Any:
+        parts, m = self.chart.parts, self.chart.m
+        values = {
+            "rules": asdict(curves.RULES) | {"starts": 1 + RULES.near_phi + RULES.near_x + RULES.more},
+            "row_rules": asdict(RULES),
+            "xi_size": float(parts.phi_sizes[m]),
+            "period": float(parts.turns[m]),
+            "winding": parts.boxed.winding,
+        }
+        sources = ("self_motion.c", "curve_math.c", "curve_rows.c")
+        library = _load("search", "chart_search.c", _write_chart(self.chart) | values, sources, self.folder)
+        library.curve_room.restype, library.curve_rows.restype = ctypes.c_ulong, None
+        return library
+
+
+def has_library(kernel: MotionKernel | SearchKernel) -> bool:
+    """Whether a kernel is there, compiled now or earlier: not without a compiler, nor for charts that C does not know.
+
+    C knows fitted coordinates with r = 1, on domains whose condition, if there is one, has an expression.
+    """
+    chart, domain = kernel.chart, kernel.chart.problem.domain
+    known = domain.is_box or domain.known_condition is not None
+    if chart.r != 1 or not known or not isinstance(chart.coordinates, Coordinates):
+        return False
+    try:
+        kernel._c  # noqa: B018
+    except (CompileError, InvalidValueError):
+        return False
+    return True
+
+
+def _load(kind: str, template: str, values: dict[str, Any], sources: tuple[str, ...], folder: Path | None) -> Any:
+    """The library of a template with its values, and of runtime sources that it includes."""
+    texts = {template: render(template, values, __package__), **{name: get_source(name) for name in sources}}
+    return load_library(keep_library(kind, texts, _FLAGS, folder))
+
+
+def _write_chart(chart: Chart) -> dict[str, Any]:
+    """What the templates take of a chart, and the numbers of the search.
+
+    Kernels are errors and gradients of the task, xi with its gradient, and the condition of the domain, if it has one.
+    """
+    domain, (low, high), own = chart.domain, chart.domain.bounds, chart.coordinates.functions
+    q, x = ca.MX.sym("q", chart.n), ca.MX.sym("x", chart.m)
+    functions = [
+        dense_function("task", [q, x], chart.parts.tracer.equations.call([q, x])),
+        dense_function("xi", [q], [chart.parts.runnable(own["xi"])(q)]),
+        dense_function("gradient", [q], [chart.parts.runnable(own["jacobian"])(q)]),
+    ]
+    if domain.condition is not None:
+        functions.append(dense_function("pivots", [q], [domain.condition.pivots(q)]))
+    kernels = generate_kernels(functions, "kernel")
+    revolute = ~np.array(chart.problem.robot.tree.prismatic)
+    return {
+        "kernels": kernels.code,
+        "arrays": kernels.declare_arrays,
+        "call": kernels.write_call,
+        "n": chart.n,
+        "low": low,
+        "high": high,
+        "centre": domain.centre,
+        "half_width": domain.half_width,
+        "revolute": revolute,
+        "endless": np.isinf(low) & revolute,
+        "bounded": np.isfinite(low),
+        "pivots": kernels.numbers.get("pivots", 0),
+    }

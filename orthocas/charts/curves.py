@@ -7,11 +7,9 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocas.charts.curve_tracer import RULES, CurveTracer, Traces, solutions_of
+from orthocas.charts.curve_tracer import RULES, CurveTracer, SearchKernel, Traces, has_library, solutions_of
 from orthocas.charts.descent import BoxedPhi
-from orthocas.charts.motion_kernel import SearchKernel, has_library
-from orthocas.charts.phi import largest
-from orthocas.charts.search import Starts
+from orthocas.charts.newton import Starts, largest
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, Indices
 from orthocas.tools.expressions import wrap_shortest
@@ -186,7 +184,12 @@ class SelfMotionCurves:
             xi_left = self._take_crossed(targets, steps, tolerance, best)
             more = best.distance[steps.row] > 0
             arcs = self._arcs(targets, steps.part(more), xi_left[more])
-            self._take_roots(targets, arcs, tolerance, best)
+            near = (arcs.inside[:, :-1] | arcs.inside[:, 1:] | arcs.passing) & (best.distance[arcs.row, None] > 0)
+            arc, place = np.nonzero(near)
+            crossed, share = self._crossed(np.stack([arcs.xi_left[arc, place], arcs.xi_left[arc, place + 1]], axis=1))
+            arc, place, share = arc[crossed], place[crossed], share[:, None]
+            guess = (1 - share) * arcs.q[arc, place] + share * arcs.q[arc, place + 1]
+            self._take_solutions(targets, arcs.row[arc], guess, tolerance, best)
             ends = ends.joined(self._take_points(targets, arcs, best))
             # other starts on these curves are done, too
             on = np.flatnonzero((best.distance[traces.row] > 0) & ~known[of].all(axis=1))
@@ -334,16 +337,6 @@ class SelfMotionCurves:
         sheets = np.unique(np.concatenate(found), axis=0)
         return sheets[:, 0].astype(np.int64), turn * sheets[:, 1:]
 
-    def _take_roots(self, targets: Array, arcs: "Arcs", tolerance: float, best: Nearest) -> None:
-        """Solutions of phi(q) = phi on arcs."""
-        near = arcs.inside[:, :-1] | arcs.inside[:, 1:] | arcs.passing
-        near &= best.distance[arcs.row, None] > 0
-        arc, place = np.nonzero(near)
-        crossed, share = self._crossed(np.stack([arcs.xi_left[arc, place], arcs.xi_left[arc, place + 1]], axis=1))
-        arc, place, share = arc[crossed], place[crossed], share[:, None]
-        q = (1 - share) * arcs.q[arc, place] + share * arcs.q[arc, place + 1]
-        self._take_solutions(targets, arcs.row[arc], q, tolerance, best)
-
     def _take_solutions(self, targets: Array, rows: Indices, q: Array, tolerance: float, best: Nearest) -> None:
         """Solutions of phi(q) = phi inside to which Newton's steps lead from points q (K, n) of some rows."""
         q, solved = self._solve(targets, rows, q, tolerance)
@@ -432,29 +425,22 @@ class SelfMotionCurves:
         return np.asarray(((q >= low) & (q <= high)).all(axis=1))
 
     def _take_ends(self, targets: Array, ends: "Ends", best: Nearest) -> None:
-        """The ends of arcs, of rows in which they may be nearest."""
+        """The ends of arcs, of rows in which they may be nearest: by halving what lies between inside and outside."""
         useful = np.flatnonzero(ends.least < best.distance[ends.row])
-        rows = ends.row[useful]
-        if rows.size:
-            q = self._end(targets[rows], ends.inside[useful], ends.outside[useful])
-            best.take(rows, q, np.abs(self._xi_left(targets[rows], q)))
-
-    def _end(self, targets: Array, inside: Array, outside: Array) -> Array:
-        """The last points of the domain between points of curves (M, n) inside and outside."""
-        x = targets[:, : self.boxed.m]
-        a, b = inside.copy(), outside.copy()
+        rows, a, b = ends.row[useful], ends.inside[useful], ends.outside[useful]
+        if not rows.size:
+            return
         # where a descent got lost on a joint without boundaries, the spacing of numbers is wider than that
         for _ in range(RULES.narrowings):
             if np.abs(b - a).max(initial=0.0) <= RULES.narrow:
                 break
-            along = b - a
-            middle = (a + b) / 2
+            along, middle = b - a, (a + b) / 2
             t = along / np.linalg.norm(along, axis=1, keepdims=True)
-            middle = middle + self.tracer.correct(x, middle, t)[0]
+            middle = middle + self.tracer.correct(targets[rows, : self.boxed.m], middle, t)[0]
             middle = np.where(np.isfinite(middle), middle, b)
             within = self._contains(middle)
             a, b = np.where(within[:, None], middle, a), np.where(within[:, None], b, middle)
-        return a
+        best.take(rows, a, np.abs(self._xi_left(targets[rows], a)))
 
     def _xi_left(self, targets: Array, q: Array) -> Array:
         """xi - xi(q), (N,)."""

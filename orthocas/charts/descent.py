@@ -1,13 +1,16 @@
 """One damped descent in a box, many rows at once: to phi(q) = phi, and to h(q) = x."""
 
+from __future__ import annotations
+
 from collections.abc import Callable
 from dataclasses import dataclass
+from itertools import pairwise, product
 
 import casadi as ca
 import numpy as np
 from numpy.typing import NDArray
 
-from orthocas.charts.phi import ROUNDING, PhiMap, largest
+from orthocas.charts.newton import PhiMap, Starts, largest
 from orthocas.tasks.domains import Domain
 from orthocas.tasks.relative import Relative
 from orthocas.tasks.samples import sample_uniform
@@ -46,38 +49,25 @@ class DescentRules:
     slack: float = 1e-13  #: of bounds
     probes: int = 32  #: positions at which full turns are tried
     same: float = 1e-9  #: change of xi that is rounding
+    stored: tuple[int, ...] = (4, 16, 64)  #: positions from which a row is searched: at first, and without a solution
+    all: int = 64  #: near phi, and as many near x, for all solutions of one target
+    stored_most: int = 32  #: iterations from one of these
+    stored_patience: int = 3  #: of these, within which the error must halve
+    rows: int = 1024  #: whose starts are held in memory
 
 
 RULES = DescentRules()
 
 
-@dataclass(frozen=True, eq=False)
-class Equations:
-    """k equations g(u) = target in a box, of many rows. Targets are values of phi, (N, n)."""
-
-    errors: Callable[[Array, Array], Array]  #: targets, u (N, n) -> (target - g(u)) / scale, (N, k)
-    jacobians: Callable[[Array, Array], Array]  #: targets, u (N, n) -> d(g / scale)/du, (N, k, n)
-    low: Array  #: lowest u, (n,)
-    high: Array  #: highest u, (n,)
-
-
-@dataclass(frozen=True, eq=False)
-class Descent:
-    """Where a descent ended."""
-
-    u: Array  #: points of the box, (N, n)
-    error: Array  #: largest errors of the equations, (N,)
-    minimal: Flags  #: rows in which the model promises no more, (N,)
-
-
 def descend(
-    equations: Equations,
+    boxed: BoxedPhi,
     targets: Array,
     start: Array,
+    whole: bool,
     most: int = RULES.most,
     patience: int = RULES.patience,
-) -> Descent:
-    """Points u of the box with the least |e(u)|^2 near a start, for each row.
+) -> tuple[Array, Array]:
+    """Points u of the box with the least |e(u)|^2 near a start, for each row, with the errors e of phi or of x alone.
 
     Each step d is the minimum of a quadratic program,
 
@@ -86,17 +76,21 @@ def descend(
     by Levenberg and Marquardt's rule.
 
     Args:
-        equations: k equations.
+        boxed: phi in the box.
         targets: values of phi, (N, n).
         start: points of the box, (N, n).
+        whole: whether phi(q) = phi is to hold, or h(q) = x alone.
         most: iterations.
         patience: iterations within which the error must halve.
+
+    Returns:
+        u (N, n), and the largest errors there, (N,).
 
     Source:
         Levenberg and Marquardt's method with an active set; ours.
     """
     with np.errstate(all="ignore"):
-        run = _Run(equations, targets, start)
+        run = _Run(boxed, targets, start, whole)
         rows, before = np.flatnonzero(np.isfinite(run.square)), run.error.copy()
         for k in range(1, most + 1):
             # rows that do not halve their error in some steps end
@@ -107,17 +101,17 @@ def descend(
             if not rows.size:
                 break
             run.advance(rows)
-    return Descent(run.u, run.error, run.minimal)
+    return run.u, run.error
 
 
 class _Run:
     """The state of all rows."""
 
-    def __init__(self, equations: Equations, targets: Array, start: Array) -> None:
+    def __init__(self, boxed: BoxedPhi, targets: Array, start: Array, whole: bool) -> None:
         N, n = start.shape
-        self._equations, self._targets = equations, targets
+        self._boxed, self._targets, self._whole = boxed, targets, whole
         self.u = start.copy()
-        self._errors = equations.errors(targets, self.u)
+        self._errors = boxed.errors(targets, self.u, whole)
         self.error, self.square = largest(self._errors), (self._errors**2).sum(axis=1)
         self.minimal = np.zeros(N, dtype=bool)
         self.damping = np.full(N, RULES.damping)
@@ -131,7 +125,8 @@ class _Run:
         """Try a step in some rows."""
         stale = rows[~self._fresh[rows]]
         if stale.size:
-            self._J[stale], self._fresh[stale] = self._equations.jacobians(self._targets[stale], self.u[stale]), True
+            self._J[stale] = self._boxed.jacobians(self._targets[stale], self.u[stale], self._whole)
+            self._fresh[stale] = True
         undefined = ~np.isfinite(self._J[rows]).all(axis=(1, 2))
         self.damping[rows[undefined]] = np.inf
         rows = rows[~undefined]
@@ -141,14 +136,14 @@ class _Run:
         mean = np.trace(H, axis1=1, axis2=2) / n + np.finfo(float).tiny
         H += (self.damping[rows] * mean)[:, None, None] * np.eye(n)
         g = -np.matmul(self._errors[rows, None], G)[:, 0]
-        programs = Programs(H, g, self._equations.low - self.u[rows], self._equations.high - self.u[rows])
+        programs = Programs(H, g, self._boxed.low - self.u[rows], self._boxed.high - self.u[rows])
         d, self._at[rows], solved = solve_programs(programs, self._at[rows])
         slope, bend = (programs.g * d).sum(axis=1), (d * (programs.H @ d[:, :, None])[:, :, 0]).sum(axis=1)
         promised = -slope - bend / 2
         ended = promised * (1 + self.damping[rows]) <= RULES.converged * self.square[rows] + RULES.rounded
         self.minimal[rows] = ended & solved
-        u = np.clip(self.u[rows] + d, self._equations.low, self._equations.high)
-        errors = self._equations.errors(self._targets[rows], u)
+        u = np.clip(self.u[rows] + d, self._boxed.low, self._boxed.high)
+        errors = self._boxed.errors(self._targets[rows], u, self._whole)
         square = (errors**2).sum(axis=1)
         gain = (self.square[rows] - square) / (2 * promised)
         better = (gain > RULES.decrease) & (promised > 0)
@@ -169,7 +164,7 @@ class Programs:
     low: Array  #: (N, n)
     high: Array  #: (N, n)
 
-    def part(self, rows: Indices) -> "Programs":
+    def part(self, rows: Indices) -> Programs:
         """Some of them."""
         return Programs(*(array[rows] for array in vars(self).values()))
 
@@ -183,34 +178,28 @@ def solve_programs(programs: Programs, at: NDArray[np.int8]) -> tuple[Array, NDA
     N = len(programs.g)
     d, held, left = np.zeros_like(programs.g), at.copy(), np.arange(N)
     for k in range(RULES.rounds):
-        part = programs if len(left) == N else programs.part(left)
-        d[left], now = _solve_held(part, held[left])
-        changes = now != held[left]
+        part, on = programs if len(left) == N else programs.part(left), held[left]
+        # joints at a bound get the equation d = bound
+        K, joint = part.H.copy(), on != 0
+        here, j = np.nonzero(joint)
+        K[here, j], K[here, j, j] = 0.0, 1.0
+        bounds = np.where(on < 0, part.low, part.high)
+        d[left] = step = np.linalg.solve(K, np.where(joint, bounds, -part.g)[:, :, None])[:, :, 0]
+        # bounds stay while the slope pushes against them; others begin where d passes them
+        slope = (part.H @ step[:, :, None])[:, :, 0] + part.g
+        now = np.where(joint, on * (slope * on < 0), 0)
+        now += ~joint * ((step > part.high + RULES.slack) * 1 - (step < part.low - RULES.slack) * 1)
+        changes = now != on
         # the first bound alone, so that they do not change back and forth
         if k >= RULES.rounds // 3:
             changes &= np.cumsum(changes, axis=1) == 1
-        held[left] = np.where(changes, now, held[left])
+        held[left] = np.where(changes, now, on)
         left = left[changes.any(axis=1)]
         if not left.size:
             break
     solved = np.ones(N, dtype=bool)
     solved[left] = False
     return np.clip(d, programs.low, programs.high), held, solved
-
-
-def _solve_held(programs: Programs, held: NDArray[np.int8]) -> tuple[Array, NDArray[np.int8]]:
-    """Solve for d (N, n) with the held bounds (N, n) as equations; returns d and the bounds to hold next."""
-    K, joint = programs.H.copy(), held != 0
-    # joints at a bound get the equation d = bound
-    here, j = np.nonzero(joint)
-    K[here, j], K[here, j, j] = 0.0, 1.0
-    bounds = np.where(held < 0, programs.low, programs.high)
-    d = np.asarray(np.linalg.solve(K, np.where(joint, bounds, -programs.g)[:, :, None])[:, :, 0], dtype=float)
-    # bounds stay while the slope pushes against them; others begin where d passes them
-    slope = (programs.H @ d[:, :, None])[:, :, 0] + programs.g
-    now = np.where(joint, held * (slope * held < 0), 0)
-    now += ~joint * ((d > programs.high + RULES.slack) * 1 - (d < programs.low - RULES.slack) * 1)
-    return d, np.asarray(now, dtype=np.int8)
 
 
 @dataclass(frozen=True, eq=False)
@@ -250,15 +239,24 @@ class BoxedPhi:
         u = (q - self.domain.centre) / self.domain.half_width
         return np.clip(u, self.low, self.high)
 
-    @cached_property
-    def phi_equations(self) -> Equations:
-        """phi(q) = phi; scale as in `PhiMap`."""
-        return Equations(self._phi_errors, self._phi_jacobians, self.low, self.high)
+    def errors(self, targets: Array, u: Array, whole: bool) -> Array:
+        """(phi - phi(q)) / scale for targets (N, n), (N, n), scale as in `PhiMap`; not `whole`: of x alone, (N, m)."""
+        if whole:
+            errors = self.phi_map.residual(targets, self.points(u))
+        else:
+            x = targets[:, : self.m]
+            errors = self._task_gaps(self.points(u), x)[0] / self.phi_map.scale(targets)[:, : self.m]
+        return np.where(np.isfinite(errors), errors, np.inf)
 
-    @cached_property
-    def task_equations(self) -> Equations:
-        """h(q) = x."""
-        return Equations(self._task_errors, self._task_jacobians, self.low, self.high)
+    def jacobians(self, targets: Array, u: Array, whole: bool) -> Array:
+        """How fast these errors fall with u, (N, n, n) or (N, m, n); 0 where undefined."""
+        if whole:
+            J = self.phi_map.jacobian(self.points(u))
+        else:
+            assert self.phi_map.difference.task is not None
+            J = self.phi_map.difference.task.batched_rates(self.points(u))[0].reshape(len(u), self.m, -1)
+        J = J * self.domain.half_width / self.phi_map.scale(targets)[:, : J.shape[1], None]
+        return np.where(np.isfinite(J), J, 0.0)
 
     def gaps(self, targets: Array, u: Array) -> Array:
         """phi - phi(q), (N, n), for targets (N, n), by the shorter way around."""
@@ -323,30 +321,6 @@ class BoxedPhi:
             BlockedFunction(dense_function("slopes", [q], [ca.cse(slopes)])),
         )
 
-    def _phi_errors(self, targets: Array, u: Array) -> Array:
-        errors = self.phi_map.residual(targets, self.points(u))
-        return np.where(np.isfinite(errors), errors, np.inf)
-
-    def _phi_jacobians(self, targets: Array, u: Array) -> Array:
-        J = self.phi_map.jacobian(self.points(u)) * self.domain.half_width / self.phi_map.scale(targets)[:, :, None]
-        return np.where(np.isfinite(J), J, 0.0)
-
-    def _task_errors(self, targets: Array, u: Array) -> Array:
-        x = targets[:, : self.m]
-        errors = self._task_gaps(self.points(u), x)[0] / self._scale(x)
-        return np.where(np.isfinite(errors), errors, np.inf)
-
-    def _task_jacobians(self, targets: Array, u: Array) -> Array:
-        x, relative = targets[:, : self.m], self.phi_map.difference.task
-        assert relative is not None
-        J = relative.batched_rates(self.points(u))[0].reshape(len(u), self.m, -1)
-        J = J * self.domain.half_width / self._scale(x)[:, :, None]
-        return np.where(np.isfinite(J), J, 0.0)
-
-    def _scale(self, x: Array) -> Array:
-        scale: Array = self.phi_map.sizes[: self.m] + ROUNDING * np.abs(x)
-        return scale
-
 
 def rooms_of(domain: Domain, q: ca.MX) -> ca.MX:
     """Smooth numbers (k, 1) that are positive just inside the conditions of a domain, and grow from 0 at their ends."""
@@ -374,3 +348,49 @@ def _pivots(A: ca.SX) -> list[ca.SX]:
         if A.shape[0] == 1:
             return found
         A = A[1:, 1:] - A[1:, 0] @ A[0, 1:] / A[0, 0]
+
+
+@dataclass(frozen=True, eq=False)
+class InDomain:
+    """Searches all of the domain, r > 1: descents within its box from stored positions, those of nearest phi first."""
+
+    boxed: BoxedPhi
+    starts: Starts
+
+    def search(self, targets: Array, tolerance: float) -> Array:
+        """The points of the domain (N, n) with the least error that are found for targets (N, n)."""
+        best, error = np.empty_like(targets), np.full(len(targets), np.inf)
+        for first in range(0, len(targets), RULES.rows):
+            rows = np.arange(first, min(first + RULES.rows, len(targets)))
+            stored = self.starts.nearest(targets[rows], RULES.stored[-1], targets.shape[1])
+            best[rows] = stored[0]
+            # few starts for all rows, then more for those without a solution
+            for begin, end in pairwise((0, *RULES.stored)):
+                left = np.flatnonzero(error[rows] > tolerance)
+                of = np.tile(rows[left], end - begin)
+                q, found = self._descend(targets[of], stored[begin:end, left].reshape(-1, targets.shape[1]), tolerance)
+                # what is written last stays
+                worst_first = np.argsort(-found, kind="stable")
+                better = worst_first[found[worst_first] < error[of[worst_first]]]
+                best[of[better]], error[of[better]] = q[better], found[better]
+        return best
+
+    def find_all(self, target: Array, near: Array, tolerance: float) -> Array:
+        """Solutions inside for a target (n,), some several times, (k, n); also from positions (S, n) near solutions."""
+        n = len(target)
+        stored = [self.starts.nearest(target[None], RULES.all, count)[:, 0] for count in (n, self.boxed.m)]
+        # joints without boundaries whose turns change xi begin a turn away as well
+        turns = list(product(*((-1, 0, 1) if winds else (0,) for winds in self.boxed.winding)))
+        starts = (np.concatenate([near, *stored])[:, None] + 2 * np.pi * np.array(turns)).reshape(-1, n)
+        q, error = self._descend(np.broadcast_to(target, starts.shape), starts, tolerance)
+        return q[error <= tolerance]
+
+    def _descend(self, targets: Array, starts: Array, tolerance: float) -> tuple[Array, Array]:
+        """Where descents end, (N, n), and the errors (N,): infinite for solutions that a condition forbids."""
+        with np.errstate(all="ignore"):
+            most, patience, u = RULES.stored_most, RULES.stored_patience, self.boxed.of_points(starts)
+            u, error = descend(self.boxed, targets, u, whole=True, most=most, patience=patience)
+        q = self.boxed.points(u)
+        solved = np.flatnonzero(error <= tolerance)
+        error[solved[~self.boxed.domain.contains(q[solved])]] = np.inf
+        return q, error

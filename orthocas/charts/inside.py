@@ -10,9 +10,7 @@ from numpy.typing import NDArray
 from orthocas.charts.curve_tracer import CurveTracer, Traces, without_turns
 from orthocas.charts.descent import RULES as DESCENT
 from orthocas.charts.descent import BoxedPhi, descend
-from orthocas.charts.newton import inverses
-from orthocas.charts.phi import largest
-from orthocas.charts.search import Starts
+from orthocas.charts.newton import Starts, inverses, largest
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, Indices
@@ -90,16 +88,15 @@ class Inside:
         Returns:
             q (N, n), and which of them have the task values, (N,).
         """
-        end = descend(self.boxed.task_equations, targets, self.boxed.of_points(q))
-        u, error = end.u, end.error
+        u, error = descend(self.boxed, targets, self.boxed.of_points(q), whole=False)
         left = np.flatnonzero(error > DESCENT.kept)
         if left.size:
             points = Points.of(self.starts.nearest(targets[left], RULES.starts, self.boxed.m), self.boxed, left)
-            end = descend(self.boxed.task_equations, targets[points.row], points.u)
+            ends, errors = descend(self.boxed, targets[points.row], points.u, whole=False)
             # what is written last stays
-            farthest_first = np.argsort(-end.error, kind="stable")
-            better = farthest_first[end.error[farthest_first] < error[points.row[farthest_first]]]
-            u[points.row[better]], error[points.row[better]] = end.u[better], end.error[better]
+            farthest_first = np.argsort(-errors, kind="stable")
+            better = farthest_first[errors[farthest_first] < error[points.row[farthest_first]]]
+            u[points.row[better]], error[points.row[better]] = ends[better], errors[better]
         return self.boxed.points(u), np.asarray(error <= DESCENT.kept)
 
     def nearest(self, targets: Array, q: Array) -> tuple[Array, Array]:
@@ -130,7 +127,7 @@ class Inside:
         left, bare = np.flatnonzero(ends.best(N)[1] > RULES.nearly), np.zeros(0, dtype=np.int64)
         if left.size:
             # points after full turns, and about how far joints have to move from there to xi
-            points = self._slices.points(targets, q, left)
+            points = self._slice(targets, q, left)
             points = self._turned(targets, points, q)
             J = self.boxed.phi_map.jacobian(self.boxed.points(points.u)) * self.boxed.domain.half_width
             with np.errstate(all="ignore"):
@@ -161,9 +158,9 @@ class Inside:
         components = q.shape[1], self.boxed.m
         near = [self.starts.nearest(targets[left], RULES.again, count) for count in components]
         points = Points.of(np.concatenate([q[None, left], *near]), self.boxed, left)
-        end = descend(self.boxed.task_equations, targets[points.row], points.u, RULES.descent)
-        kept = (end.error <= DESCENT.kept) & self.boxed.domain.contains(self.boxed.points(end.u))
-        return points.joined(Points(points.row[kept], end.u[kept], *np.zeros((2, kept.sum()))))
+        u, error = descend(self.boxed, targets[points.row], points.u, whole=False, most=RULES.descent)
+        kept = (error <= DESCENT.kept) & self.boxed.domain.contains(self.boxed.points(u))
+        return points.joined(Points(points.row[kept], u[kept], *np.zeros((2, kept.sum()))))
 
     def _slid(self, targets: Array, points: "Points", most: int) -> "Points":
         """Where slides from points end."""
@@ -179,9 +176,73 @@ class Inside:
         away = np.linalg.norm(self.boxed.xi_gaps(targets[points.row], self.boxed.points(u))[:, None] - shifts, axis=2)
         return Points(points.row, u + turn * turns[np.argmin(away, axis=1)], away.min(axis=1), points.error)
 
+    def _slice(self, targets: Array, own: Array, rows: Indices) -> "Points":
+        """Points of the domain with x nearly as in some rows of targets (N, n), on curves.
+
+        Where r - 1 joints are held, all positions of a regular x form closed curves, as they do for r = 1. The held
+        joints are those that move x least over their ranges: the first of them at its boundaries and between, the
+        others where stored positions near x have them. So the curves pass through most of the regions that positions
+        with x form.
+
+        Joints are turned towards given positions (N, n), where they can turn more than once; those without boundaries
+        whose turns change xi unevenly towards the centre of the domain, and once more to both sides.
+        """
+        domain, (low, high), turning = self.boxed.domain, self.boxed.domain.bounds, self._tracer.turning
+        # of endless joints whose turns change xi unevenly, the turns on both sides as well
+        uneven = turning & ~np.isfinite(low) & ~self.boxed.even
+        several = ~uneven & ((domain.half_width > np.pi) | ~np.isfinite(low))
+        turns = 2 * np.pi * np.array(list(product(*((-1, 0, 1) if more else (0,) for more in uneven))))
+        found = [Points.of(own[:0, None], self.boxed)]
+        with np.errstate(all="ignore"):
+            for traces in self._curves(targets[rows]):
+                # points of the curves, moved by full turns next to where the row is, then into the box
+                curve, place = np.nonzero(np.arange(traces.q.shape[1]) < traces.count[:, None])
+                row, q = rows[traces.row[curve] // len(RULES.places)], traces.q[curve, place]
+                towards = np.where(several, own[row], domain.centre)
+                q = towards + without_turns(q - towards, turning)
+                back = (q < low - RULES.slack) * 1 - (q > high + RULES.slack) * 1
+                q = turns[:, None] + q + np.where(turning, 2 * np.pi * back, 0.0)
+                inside = np.asarray(((q >= low - RULES.slack) & (q <= high + RULES.slack)).all(axis=2))
+                number = np.arange(inside.size).reshape(inside.shape)
+                # of points inside, every few from where a curve enters
+                enters = inside & ~np.roll(inside, 1, axis=1)
+                inside &= (number - np.maximum.accumulate(np.where(enters, number, 0), axis=1)) % RULES.stride == 0
+                inside[inside] = domain.contains(np.clip(q[inside], low, high))
+                found.append(Points.of(q[None, inside], self.boxed, np.broadcast_to(row, inside.shape)[inside]))
+        return reduce(Points.joined, found)
+
+    def _curves(self, targets: Array) -> list[Traces]:
+        """Curves of all slices; number k of K of target j is row K j + k."""
+        m, n, K = self.boxed.m, targets.shape[1], len(RULES.places)
+        # stored positions near each target, put onto each slice
+        near = self.starts.nearest(targets, RULES.near_phi, n), self.starts.nearest(targets, RULES.near_x, m)
+        start = np.repeat(np.concatenate(near).transpose(1, 0, 2), K, axis=0)
+        held, domain = list(self._tracer.held), self.boxed.domain
+        places = domain.centre[held[0]] + domain.half_width[held[0]] * np.array(RULES.places)
+        start[:, :, held[0]] = np.tile(places, len(targets))[:, None]
+        x = np.concatenate(
+            [np.repeat(targets[:, :m], K, axis=0)[:, None].repeat(start.shape[1], axis=1), start[:, :, held]], axis=2
+        )
+        # from there to x, and along the curves; starts on known curves are done
+        q, arrived = self._tracer.reach(x.reshape(-1, n - 1), start.reshape(-1, n))
+        q, known, found = q.reshape(start.shape), ~arrived.reshape(start.shape[:2]), []
+        away = self._tracer.away(q)
+        while not known.all():
+            left = np.flatnonzero(~known.all(axis=1))
+            first = np.argmin(np.where(known[left], np.inf, away[left]), axis=1)
+            found.append(self._tracer.trace(x[left, first], q[left, first], left))
+            known[left, first] = True
+            on = np.flatnonzero(~known[left].all(axis=1))
+            known[left[on]] |= self._tracer.on_curves(q[left[on]], found[-1].part(on))
+        return found
+
     @cached_property
-    def _slices(self) -> "Slices":
-        return Slices(self.boxed, self.starts)
+    def _tracer(self) -> CurveTracer:
+        """Traces the curves of slices."""
+        q = sample_uniform(self.boxed.domain, RULES.probes, 0)
+        J = self.boxed.phi_map.jacobian(q)[:, : self.boxed.m] / self.boxed.phi_map.sizes[: self.boxed.m, None]
+        reach = np.nanmean(np.linalg.norm(J, axis=1), axis=0) * self.boxed.domain.half_width
+        return CurveTracer(self.boxed, tuple(int(j) for j in np.argsort(reach)[: q.shape[1] - self.boxed.m - 1]))
 
     @cached_property
     def _turns(self) -> tuple[Array, Array]:
@@ -255,82 +316,6 @@ class Points:
             # a row that is nearly solved needs no other point
             left[rows[(self.away[best] <= RULES.nearly) & (self.error[best] <= settled)]] = False
         return self.part(np.concatenate(chosen))
-
-
-@dataclass(frozen=True, eq=False)
-class Slices:
-    """Finds positions with the task values x, and any xi, r > 1.
-
-    Where r - 1 joints are held, all positions of a regular x form closed curves, as they do for r = 1. The held joints
-    are those that move x least over their ranges: the first of them at its boundaries and between, the others where
-    stored positions near x have them. So the curves pass through most of the regions that positions with x form.
-    """
-
-    boxed: BoxedPhi
-    starts: Starts
-
-    def points(self, targets: Array, own: Array, rows: Indices) -> Points:
-        """Points of the domain with x nearly as in some rows of targets (N, n).
-
-        Joints are turned towards given positions (N, n), where they can turn more than once; those without boundaries
-        whose turns change xi unevenly towards the centre of the domain, and once more to both sides.
-        """
-        domain, (low, high), turning = self.boxed.domain, self.boxed.domain.bounds, self.tracer.turning
-        # of endless joints whose turns change xi unevenly, the turns on both sides as well
-        uneven = turning & ~np.isfinite(low) & ~self.boxed.even
-        several = ~uneven & ((domain.half_width > np.pi) | ~np.isfinite(low))
-        turns = 2 * np.pi * np.array(list(product(*((-1, 0, 1) if more else (0,) for more in uneven))))
-        found = [Points.of(own[:0, None], self.boxed)]
-        with np.errstate(all="ignore"):
-            for traces in self._curves(targets[rows]):
-                # points of the curves, moved by full turns next to where the row is, then into the box
-                curve, place = np.nonzero(np.arange(traces.q.shape[1]) < traces.count[:, None])
-                row, q = rows[traces.row[curve] // len(RULES.places)], traces.q[curve, place]
-                towards = np.where(several, own[row], domain.centre)
-                q = towards + without_turns(q - towards, turning)
-                back = (q < low - RULES.slack) * 1 - (q > high + RULES.slack) * 1
-                q = turns[:, None] + q + np.where(turning, 2 * np.pi * back, 0.0)
-                inside = np.asarray(((q >= low - RULES.slack) & (q <= high + RULES.slack)).all(axis=2))
-                number = np.arange(inside.size).reshape(inside.shape)
-                # of points inside, every few from where a curve enters
-                enters = inside & ~np.roll(inside, 1, axis=1)
-                inside &= (number - np.maximum.accumulate(np.where(enters, number, 0), axis=1)) % RULES.stride == 0
-                inside[inside] = domain.contains(np.clip(q[inside], low, high))
-                found.append(Points.of(q[None, inside], self.boxed, np.broadcast_to(row, inside.shape)[inside]))
-        return reduce(Points.joined, found)
-
-    def _curves(self, targets: Array) -> list[Traces]:
-        """Curves of all slices; number k of K of target j is row K j + k."""
-        m, n, K = self.boxed.m, targets.shape[1], len(RULES.places)
-        # stored positions near each target, put onto each slice
-        near = self.starts.nearest(targets, RULES.near_phi, n), self.starts.nearest(targets, RULES.near_x, m)
-        start = np.repeat(np.concatenate(near).transpose(1, 0, 2), K, axis=0)
-        held, domain = list(self.tracer.held), self.boxed.domain
-        places = domain.centre[held[0]] + domain.half_width[held[0]] * np.array(RULES.places)
-        start[:, :, held[0]] = np.tile(places, len(targets))[:, None]
-        x = np.concatenate(
-            [np.repeat(targets[:, :m], K, axis=0)[:, None].repeat(start.shape[1], axis=1), start[:, :, held]], axis=2
-        )
-        # from there to x, and along the curves; starts on known curves are done
-        q, arrived = self.tracer.reach(x.reshape(-1, n - 1), start.reshape(-1, n))
-        q, known, found = q.reshape(start.shape), ~arrived.reshape(start.shape[:2]), []
-        away = self.tracer.away(q)
-        while not known.all():
-            left = np.flatnonzero(~known.all(axis=1))
-            first = np.argmin(np.where(known[left], np.inf, away[left]), axis=1)
-            found.append(self.tracer.trace(x[left, first], q[left, first], left))
-            known[left, first] = True
-            on = np.flatnonzero(~known[left].all(axis=1))
-            known[left[on]] |= self.tracer.on_curves(q[left[on]], found[-1].part(on))
-        return found
-
-    @cached_property
-    def tracer(self) -> CurveTracer:
-        """Traces the curves."""
-        q = sample_uniform(self.boxed.domain, RULES.probes, 0)
-        J = self.boxed.phi_map.jacobian(q)[:, : self.boxed.m] / self.boxed.phi_map.sizes[: self.boxed.m, None]
-        reach = np.nanmean(np.linalg.norm(J, axis=1), axis=0) * self.boxed.domain.half_width
-        return CurveTracer(self.boxed, tuple(int(j) for j in np.argsort(reach)[: q.shape[1] - self.boxed.m - 1]))
 
 
 @dataclass(frozen=True, eq=False)

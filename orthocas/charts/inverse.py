@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from enum import IntEnum
 from typing import TYPE_CHECKING, Any, Self
 
@@ -13,10 +12,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from orthocas.charts.coordinates import InvertibleMap
 from orthocas.charts.curves import SelfMotionCurves
+from orthocas.charts.descent import InDomain
 from orthocas.charts.inside import Inside
-from orthocas.charts.newton import Attempt, Continuation, LocalSolver
-from orthocas.charts.phi import PhiMap, largest
-from orthocas.charts.search import InDomain, Starts
+from orthocas.charts.newton import Attempt, Continuation, LocalSolver, PhiMap, Starts, largest
 from orthocas.errors import InvalidValueError, InverseError, NoExpressionError, ShapeError, units_hint
 from orthocas.robots.collisions import Collisions
 from orthocas.tasks.problem import Problem
@@ -71,13 +69,10 @@ class InverseStatus(IntEnum):
     COLLIDING = 8  #: a solution inside the domain where a pair touches; no free one was found
 
 
-_KEPT = (InverseStatus.NEAREST, InverseStatus.OUTSIDE_DOMAIN)  # x, if q is to lie inside
-_UNSOLVED = (InverseStatus.NOT_FOUND, InverseStatus.OUT_OF_REACH)
-_MOVED = (InverseStatus.OUTSIDE_DOMAIN, InverseStatus.LIMIT, *_UNSOLVED)
 _ACCEPTED = (InverseStatus.FOUND, InverseStatus.NEAREST)
-_SOLVED = (*_ACCEPTED, InverseStatus.OUTSIDE_DOMAIN, InverseStatus.LIMIT, InverseStatus.COLLIDING)
-_FAILED = (InverseStatus.NOT_FOUND, InverseStatus.BAD_INPUT, InverseStatus.OUT_OF_REACH)
 _BEYOND = (InverseStatus.OUTSIDE_DOMAIN, InverseStatus.LIMIT)
+_FAILED = (InverseStatus.NOT_FOUND, InverseStatus.BAD_INPUT, InverseStatus.OUT_OF_REACH)
+_COLUMNS = ("q", "status", "iterations", "error", "distance")  # of solutions, a row for each target
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -103,8 +98,8 @@ class Solutions(Shown):
     tolerance: float  #: the largest error of a solution
 
     def __post_init__(self) -> None:
-        for array in (self.q, self.status, self.iterations, self.error, self.distance):
-            array.setflags(write=False)
+        for name in _COLUMNS:
+            getattr(self, name).setflags(write=False)
 
     def __len__(self) -> int:
         return len(self.q)
@@ -122,24 +117,12 @@ class Solutions(Shown):
     def facts(self) -> dict[str, str]:
         """How many rows ended how."""
         counts = {status.name: int((self.status == status).sum()) for status in InverseStatus}
-        solved = self.error[np.isin(self.status, _SOLVED)]
+        solved = self.error[np.isin(self.status, (*_ACCEPTED, *_BEYOND, InverseStatus.COLLIDING))]
         return {
             "solutions": listed(f"{count} {name}" for name, count in counts.items() if count) or "no rows",
             **({"largest error": f"{solved.max():.3g}"} if solved.size else {}),
             **({"iterations": f"{self.iterations.mean():.3g} on average"} if len(self) else {}),
         }
-
-    def row(self, k: int) -> Solutions:
-        """One row alone."""
-        part = slice(k, k + 1)
-        return Solutions(
-            self.q[part],
-            self.status[part],
-            self.iterations[part],
-            self.error[part],
-            self.distance[part],
-            self.tolerance,
-        )
 
     def require(self, inside: bool = True) -> Self:
         """These solutions, if all rows have one.
@@ -245,7 +228,7 @@ def solve_all(chart: Chart, phi: Array, tolerance: float, collisions: Collisions
     assert whole is not None
     # what Newton's method finds from stored points, then all of the domain
     starts = search.starts.nearest(phi[None], RULES.first, chart.n)[:, 0]
-    near = (search.brief or search.local)(np.broadcast_to(phi, starts.shape), starts)
+    near = search.brief(np.broadcast_to(phi, starts.shape), starts)
     solved = near.q[largest(near.residual) <= tolerance]
     every = np.concatenate([solved[domain.contains(solved)], whole.find_all(phi, near.q, float(tolerance))])
     # where full turns change xi, solutions have no end: those within one and a half turns of the centre
@@ -275,22 +258,23 @@ def solve_all(chart: Chart, phi: Array, tolerance: float, collisions: Collisions
 
 def prefer_free(chart: Chart, phi: ArrayLike, found: Solutions, collisions: Collisions) -> Solutions:
     """Solutions for phi with free ones in place of those that touch, where there are any."""
-    rows = np.flatnonzero(np.isin(found.status, (InverseStatus.FOUND, InverseStatus.NEAREST)))
+    rows = np.flatnonzero(np.isin(found.status, _ACCEPTED))
     rows = rows[~collisions.check_free(found.q[rows])] if rows.size else rows
     if not rows.size:
         return found
     # rows whose solution touches something
-    status, targets = found.status.copy(), as_rows("phi", phi, chart.n)[0]
-    status[rows] = InverseStatus.COLLIDING
-    parts = [replace(found, status=status).row(k) for k in range(len(found))]
+    columns, targets = {name: getattr(found, name).copy() for name in _COLUMNS}, as_rows("phi", phi, chart.n)[0]
+    columns["status"][rows] = InverseStatus.COLLIDING
     # of all solutions of such a row, the free one nearest to the first
-    for k in rows[found.status[rows] == InverseStatus.FOUND].tolist():
-        if not isinstance(chart.coordinates, InvertibleMap):
-            every = solve_all(chart, targets[k], found.tolerance, collisions)
-            free = np.flatnonzero(every.found)
-            if free.size:
-                parts[k] = every.row(free[np.argmin(np.linalg.norm(every.q[free] - found.q[k], axis=1))])
-    return join_solutions(parts)
+    grown = isinstance(chart.coordinates, InvertibleMap)
+    for k in () if grown else rows[found.status[rows] == InverseStatus.FOUND].tolist():
+        every = solve_all(chart, targets[k], found.tolerance, collisions)
+        free = np.flatnonzero(every.found)
+        if free.size:
+            nearest = free[np.argmin(np.linalg.norm(every.q[free] - found.q[k], axis=1))]
+            for name, values in columns.items():
+                values[k] = getattr(every, name)[nearest]
+    return Solutions(**columns, tolerance=found.tolerance)
 
 
 def require_solutions(
@@ -332,13 +316,6 @@ def require_expression(chart: Chart, what: str) -> None:
     """Raise NoExpressionError if the coordinates are grown."""
     if isinstance(chart.coordinates, InvertibleMap):
         raise NoExpressionError(f"{what} needs coordinates with a CasADi expression; received grown coordinates")
-
-
-def join_solutions(parts: Sequence[Solutions]) -> Solutions:
-    """All rows, in this order."""
-    names = ("q", "status", "iterations", "error", "distance")
-    columns = {name: np.concatenate([getattr(part, name) for part in parts]) for name in names}
-    return Solutions(**columns, tolerance=parts[0].tolerance)
 
 
 def beyond_reach(task: Task, x: Array) -> NDArray[np.bool_]:
@@ -400,12 +377,12 @@ class Inverse:
     problem: Problem
     phi_map: PhiMap
     local: LocalSolver
+    brief: LocalSolver  #: in place of `local` where another search follows anyway; it may give up early
     starts: Starts
     along: Continuation | None = None  #: follows lines of values from given starts; for fitted coordinates
     in_domain: InDomain | None = None  #: searches all of the domain; for fitted coordinates with r > 1
     inside: Inside | None = None  #: finds points inside that keep the task; for fitted coordinates
     curves: SelfMotionCurves | None = None  #: finds the nearest xi at a task value; for fitted coordinates with r = 1
-    brief: LocalSolver | None = None  #: in place of `local` where curves are searched anyway; it may give up early
 
     def solve(self, targets: Array, starts: Array | None, tolerance: float, inside: bool) -> Solutions:
         """Solutions for targets (N, n), from starts (N, n) or our own. Rows that are not finite fail."""
@@ -422,34 +399,41 @@ class Inverse:
                     some, self._search(targets[some], None if starts is None else starts[some], tolerance, inside)
                 )
         # |xi(q) - xi|: infinite where xi(q) is undefined
-        error, of_xi = found.error, (found.residual * self.phi_map.scale(targets))[:, self.problem.m :]
+        error, of_xi = found.error, (found.residual * self.phi_map.scale(targets))[:, self._m :]
         distance = np.sqrt((of_xi**2).sum(axis=1))
         distance[~np.isfinite(distance)] = np.inf
         error[~good] = distance[~good] = np.nan
         if inside:
-            kept = np.isin(found.status, _KEPT)
-            error[kept] = largest(found.residual[kept, : self.problem.m])
+            kept = np.isin(found.status, (InverseStatus.NEAREST, InverseStatus.OUTSIDE_DOMAIN))
+            error[kept] = largest(found.residual[kept, : self._m])
         return Solutions(found.q, found.status, found.iterations, error, distance, tolerance)
 
     def _search(self, targets: Array, starts: Array | None, tolerance: float, inside: bool) -> Found:
         """What the search finds from given starts, or from the rough inverse and, where that fails, in the domain."""
         # Where a longer search follows in any case, as with `inside`, so that both begin it at the same places.
         follows = inside or (starts is None and (self.curves is not None or not self.problem.domain.is_box))
-        first = self.local if self.brief is None or not follows else self.brief
+        first = self.brief if follows else self.local
         best = self._attempt(targets, self.starts.guess(targets) if starts is None else starts, tolerance, first)
         # most rows end here
         if not best.status.any():
             return best
         # rows without a solution, because the arm is too short
         rows = np.flatnonzero(best.status == InverseStatus.NOT_FOUND)
-        beyond = beyond_reach(self.problem.task, targets[rows, : self.problem.m])
+        beyond = beyond_reach(self.problem.task, targets[rows, : self._m])
         best.status[rows[beyond]] = InverseStatus.OUT_OF_REACH
         if inside and self.inside is not None:
             own = best.q.copy() if starts is None else starts
             if self.curves is not None:
                 self._search_curves(self.curves, self.inside, targets, best, own, tolerance)
             else:
-                self._search_inside(self.inside, targets, best, own, tolerance)
+                # other solutions, or the nearest coordinates, inside the domain
+                rows = np.flatnonzero(best.status != InverseStatus.FOUND)
+                q, distance = self.inside.nearest(targets[rows], own[rows])
+                has = np.isfinite(distance)
+                self._replace(targets, best, rows[has], q[has], tolerance)
+                missing = rows[~has]
+                q = self.inside.with_task(targets[missing], best.q[missing])[0]
+                self._replace(targets, best, missing, q, tolerance)
                 # Descents in a box find solutions that slides in it miss.
                 if self.problem.domain.is_box:
                     self._search_domain(targets, best, own, tolerance)
@@ -483,7 +467,7 @@ class Inverse:
         if not rows.size or self.in_domain is None or self.inside is None:
             return
         if self.problem.domain.is_box:
-            q = self.in_domain.search(targets[rows], tolerance)[0]
+            q = self.in_domain.search(targets[rows], tolerance)
         else:  # it may be a small part of its box, and most cells lie outside
             q = self.inside.nearest(targets[rows], own[rows])[0]
         # other coordinates: the best point of the cells, or near stored ones
@@ -537,22 +521,13 @@ class Inverse:
         self._replace(targets, best, rows[has], near.q[has], tolerance)
         return np.asarray(rows[~has], dtype=np.int64)
 
-    def _search_inside(self, inside: Inside, targets: Array, best: Found, own: Array, tolerance: float) -> None:
-        """Replace what is not found by other solutions, or the nearest coordinates, inside the domain."""
-        rows = np.flatnonzero(best.status != InverseStatus.FOUND)
-        q, distance = inside.nearest(targets[rows], own[rows])
-        has = np.isfinite(distance)
-        self._replace(targets, best, rows[has], q[has], tolerance)
-        missing = rows[~has]
-        self._replace(targets, best, missing, inside.with_task(targets[missing], best.q[missing])[0], tolerance)
-
     def _replace(self, targets: Array, best: Found, rows: Indices, q: Array, tolerance: float) -> None:
         """Put points of the box into some rows, with their status; singular solutions stay."""
-        moved = np.isin(best.status[rows], _MOVED)
+        moved = np.isin(best.status[rows], (*_BEYOND, InverseStatus.NOT_FOUND, InverseStatus.OUT_OF_REACH))
         rows, q = rows[moved], q[moved]
         residual = self.phi_map.residual(targets[rows], q)
         # a status claims no more than was checked: x, all of phi, the domain
-        kept, inside = largest(residual[:, : self.problem.m]) <= tolerance, self.problem.domain.contains(q)
+        kept, inside = largest(residual[:, : self._m]) <= tolerance, self.problem.domain.contains(q)
         whole = kept & (largest(residual) <= tolerance)
         best.q[rows], best.residual[rows] = q, residual
         beyond = best.status[rows] == InverseStatus.OUT_OF_REACH
@@ -590,6 +565,11 @@ class Inverse:
         if doubtful.size:
             status[doubtful[self.phi_map.is_singular(attempt.q[doubtful])]] = InverseStatus.SINGULAR
         return Found(attempt.q, attempt.residual, attempt.iterations, status)
+
+    @cached_property
+    def _m(self) -> int:
+        """Number of task components."""
+        return self.problem.m
 
     @cached_property
     def _bounds(self) -> tuple[Array, Array]:

@@ -3,17 +3,82 @@
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
+from math import comb
 from typing import Any, Protocol
 
 import casadi as ca
 import numpy as np
+import scipy
 from numpy.typing import NDArray
 
 from orthocas.charts.coordinates import InvertibleMap
-from orthocas.charts.phi import ROUNDING, Differences, PhiMap, largest
+from orthocas.errors import SingularTaskError
+from orthocas.tasks.domains import Domain
+from orthocas.tasks.relative import Relative
+from orthocas.tasks.samples import sample_boundary_weighted
 from orthocas.tools.batch import dense_function, run_in_threads
+from orthocas.tools.cached import BuiltOnUse, cached_property
 from orthocas.tools.checks import Array, Indices
+from orthocas.tools.expressions import wrap_shortest
 from orthocas.tools.interrupts import deferred
+
+ROUNDING = 1e-5  #: of phi: 1e-9 of it are 45 units in the last place
+_SINGULAR = 1e-8  # ratio of singular values of J below which the inverse map fails
+
+
+@dataclass(frozen=True)
+class Differences:
+    """Differences of two phi: the shorter way around for periodic components and for orientations."""
+
+    turns: Array  #: periods of the components, (n,); 0 for those that have none
+    task: Relative | None = None  #: of the first components; None for plain differences
+
+    def __call__(self, targets: Any, values: Any) -> Any:
+        """Targets - values, as NumPy rows (..., n) or CasADi columns (n, 1)."""
+        if self.task is None or not self.task.turned:
+            return wrap_shortest(targets - values, self.turns)
+        # orientations differ by a rotation, other components by numbers
+        m, symbolic = self.task.task.m, isinstance(values, ca.SX | ca.MX)
+        pair = (targets[:m], values[:m]) if symbolic else (targets[..., :m], values[..., :m])
+        first = self.task.difference(*pair)
+        if symbolic:
+            return ca.vertcat(first, wrap_shortest(targets[m:] - values[m:], self.turns[m:]))
+        rest = wrap_shortest(targets[..., m:] - values[..., m:], self.turns[m:])
+        return np.concatenate([first, rest], axis=-1)
+
+
+@dataclass(frozen=True)
+class PhiMap:
+    """phi at many points. Points are finite, values need not be."""
+
+    phi: Callable[[Array], Array]  #: (N, n) -> (N, n)
+    jacobian: Callable[[Array], Array]  #: (N, n) -> (N, n, n): how fast phi moves, d(difference) = -J dq where it is 0
+    sizes: Array  #: sizes of the components, (n,)
+    difference: Differences  #: of targets (..., n) and values (..., n)
+
+    def scale(self, targets: Array) -> Array:
+        """Scale of errors (N, n): the sizes of the components, and more where rounding of phi exceeds them."""
+        scale: Array = self.sizes + ROUNDING * np.abs(targets)
+        return scale
+
+    def residual(self, targets: Array, q: Array) -> Array:
+        """(phi - phi(q)) / scale, (N, n), by the shorter way around."""
+        residual: Array = self.difference(targets, self.phi(q)) / self.scale(targets)
+        return residual
+
+    def is_singular(self, q: Array) -> NDArray[np.bool_]:
+        """Whether J is singular or undefined at points (N, n), (N,)."""
+        J = self.jacobian(q) / self.sizes[:, None]
+        known = np.asarray(np.isfinite(J).all(axis=(1, 2)))
+        J[~known] = 0.0
+        values = np.linalg.svd(J, compute_uv=False)
+        return np.asarray(~known | (values[:, -1] <= _SINGULAR * values[:, 0]))
+
+
+def largest(residual: Array) -> Array:
+    """The largest entries of residuals (N, n), (N,): infinite where phi is undefined."""
+    error = np.abs(residual).max(axis=1)
+    return np.where(np.isfinite(error), error, np.inf)
 
 
 @dataclass(frozen=True, slots=True)
@@ -55,11 +120,6 @@ class Attempt:
     iterations: Indices  #: (N,)
     suspicious: NDArray[np.bool_]  #: whether J may be singular there, (N,)
     inside: NDArray[np.bool_] | None = None  #: which rows lie inside the domain for certain, (N,); None: not looked at
-
-    @classmethod
-    def empty(cls, N: int, n: int) -> "Attempt":
-        """Room for N rows."""
-        return cls(np.empty((N, n)), np.empty((N, n)), np.zeros(N, dtype=np.int64), np.zeros(N, dtype=bool))
 
     def replace(self, rows: Indices, other: "Attempt") -> None:
         """Put the results of another search in some rows."""
@@ -142,9 +202,18 @@ class _Run:
         # halve the steps of rows whose error does not decrease
         left = np.flatnonzero(np.isfinite(steps).all(axis=1))
         for halvings in range(most + 1):
-            moved = self._try(rows[left], steps[left], 0.5**halvings)
-            goes_on[left[moved]] = True
-            left = left[~moved]
+            tried, share = rows[left], 0.5**halvings
+            q = self.q[tried] + share * steps[left]
+            residual = self._map.residual(self._targets[tried], q)
+            before, error = self.error[tried], largest(residual)
+            # a sufficient decrease, as for line searches; slow rows get a new J
+            better = error < (1 - NEWTON.decrease * share) * before
+            moved = tried[better]
+            self.q[moved], self.residual[moved], self.error[moved] = q[better], residual[better], error[better]
+            self.iterations[moved] += 1
+            self.stale[moved] = error[better] > NEWTON.keep * before[better]
+            goes_on[left[better]] = True
+            left = left[~better]
             # before that, rows with an old J ask for a new one, and rows that only rounding stops end
             if halvings == 0:
                 waiting = ~self._fresh[rows[left]]
@@ -154,19 +223,6 @@ class _Run:
                 break
         self._fresh[rows] = False
         return goes_on
-
-    def _try(self, rows: Indices, steps: Array, share: float) -> NDArray[np.bool_]:
-        """Take parts of steps where they reduce the error; returns where."""
-        q = self.q[rows] + share * steps
-        residual = self._map.residual(self._targets[rows], q)
-        before, error = self.error[rows], largest(residual)
-        # a sufficient decrease, as for line searches; slow rows get a new J
-        better = error < (1 - NEWTON.decrease * share) * before
-        moved = rows[better]
-        self.q[moved], self.residual[moved], self.error[moved] = q[better], residual[better], error[better]
-        self.iterations[moved] += 1
-        self.stale[moved] = error[better] > NEWTON.keep * before[better]
-        return better
 
     @property
     def suspicious(self) -> NDArray[np.bool_]:
@@ -401,7 +457,8 @@ class FewRows:
         """Search from starts (N, n)."""
         if len(targets) > NEWTON.few:
             return self._other(targets, starts)
-        attempt = Attempt.empty(*targets.shape)
+        steps, sure = np.zeros(len(targets), dtype=np.int64), np.zeros(len(targets), dtype=bool)
+        attempt = Attempt(np.empty(targets.shape), np.empty(targets.shape), steps, sure)
         # otherwise CasADi turns Ctrl-C into a RuntimeError, or swallows it
         with deferred():
             try:
@@ -450,3 +507,109 @@ def inverse_function(phi: ca.Function, sizes: Array, difference: Differences) ->
         ca.norm_2(residual(found)) <= NEWTON.tolerance, 0.0, np.nan
     )  # a constant, so without derivatives
     return ca.Function("inverse", [target, start], [found + failed], ["phi", "q_start"], ["q"])
+
+
+@dataclass(frozen=True, slots=True)
+class StartRules:
+    """Numbers of starts. Chosen and held on the ready charts, other seeds (benchmarks/round_trips.py)."""
+
+    points: int = 4096  #: of the table of stored positions
+    seed: int = 0  #: of these
+    degrees: tuple[int, ...] = (3, 2, 1)  #: of the rough inverse: the first one with so few terms
+    most_terms: int = 500
+    overshoot: float = 1.2  #: beyond the values of the table, polynomials are not trusted
+
+
+STARTS = StartRules()
+
+
+class Starts:
+    """Joint positions from which Newton's method may reach phi(q) = phi.
+
+    The rough inverse is a polynomial q(phi), fitted to 4,096 points of the domain by least squares. Both coordinates
+    and task are smooth, so it is much closer than the centre of the domain. It takes 0.1 s once for each chart.
+    """
+
+    def __init__(self, phi_map: PhiMap, domain: Domain) -> None:
+        self._map, self._domain = phi_map, domain
+
+    def guess(self, targets: Array) -> Array:
+        """The rough inverse at targets (N, n), moved into the box of the domain, (N, n)."""
+        centre, half_width = self._domain.centre, self._domain.half_width
+        q = _terms(self._normalised(targets), self._degree) @ self._coefficients
+        guess: Array = np.clip(q, centre - half_width, centre + half_width)
+        return guess
+
+    def nearest(self, targets: Array, count: int, components: int) -> Array:
+        """The points of the table whose phi is nearest to targets (N, n), nearest first, (count or fewer, N, n).
+
+        Args:
+            targets: values of phi.
+            count: points for each target.
+            components: how many components of phi count, the first ones.
+        """
+        points = self._table[0]
+        order = self._trees[components].query(self._places(targets, components), range(1, min(count, len(points)) + 1))[
+            1
+        ]
+        nearest: Array = points[order.T]
+        return nearest
+
+    @cached_property
+    def _trees(self) -> BuiltOnUse[int, Any]:
+        """Search trees of places of the table, by the number of components that count."""
+        return BuiltOnUse(lambda components: scipy.spatial.cKDTree(self._places(self._table[1], components)))
+
+    def _places(self, phi: Array, components: int) -> Array:
+        """Numbers (N, k) that are near one another where the first components of phi (N, n) are."""
+        normalised, relative = self._normalised(phi)[:, :components], self._map.difference.task
+        if relative is None or not relative.turned:
+            return normalised
+        first, last = relative.first, relative.task.m
+        orientations = relative.embed(phi[:, :last]) / self._range[1][first:last].mean()
+        return np.concatenate([normalised[:, :first], orientations, normalised[:, last:]], axis=1)
+
+    @cached_property
+    def _table(self) -> tuple[Array, Array]:
+        """Points of the domain where phi is defined, and phi, (K, n) each."""
+        points = sample_boundary_weighted(self._domain, STARTS.points, STARTS.seed)
+        phi = self._map.phi(points)
+        known = np.isfinite(phi).all(axis=1)
+        if not known.any():
+            raise SingularTaskError(f"phi is not finite at any of {len(points)} samples of the domain")
+        return points[known], phi[known]
+
+    @cached_property
+    def _range(self) -> tuple[Array, Array]:
+        """Middle and half of the range of phi over the domain, (n,) each."""
+        low, high = self._table[1].min(axis=0), self._table[1].max(axis=0)
+        return (low + high) / 2, np.where(high > low, (high - low) / 2, 1.0)
+
+    @cached_property
+    def _coefficients(self) -> Array:
+        """Coefficients of the rough inverse, (terms, n)."""
+        points, phi = self._table
+        found = np.linalg.lstsq(_terms(self._normalised(phi), self._degree), points, rcond=None)[0]
+        return np.asarray(found, dtype=float)
+
+    @property
+    def _degree(self) -> int:
+        n = len(self._domain.centre)
+        return next((degree for degree in STARTS.degrees if comb(n + degree, degree) <= STARTS.most_terms), 1)
+
+    def _normalised(self, phi: Array) -> Array:
+        """Values of phi (N, n) in the range [-1, 1], or a little beyond."""
+        middle, half = self._range
+        return np.clip((phi - middle) / half, -STARTS.overshoot, STARTS.overshoot)
+
+
+def _terms(u: Array, degree: int) -> Array:
+    """All monomials of the columns of u (N, n) up to a degree, (N, terms)."""
+    columns = np.ascontiguousarray(u.T)
+    # index of the last factor, product
+    level = [(0, np.ones(len(u)))]
+    terms = [level[0][1]]
+    for _ in range(degree):
+        level = [(j, product * columns[j]) for i, product in level for j in range(i, len(columns))]
+        terms += [product for _, product in level]
+    return np.array(terms).T

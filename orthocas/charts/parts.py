@@ -9,25 +9,25 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.charts.coordinates import Coordinates, InvertibleMap
-from orthocas.charts.curve_tracer import CurveTracer
+from orthocas.charts.coordinates import Coordinates, InvertibleMap, fill_coordinates
+from orthocas.charts.curve_tracer import CurveTracer, MotionKernel, SearchKernel, has_library
 from orthocas.charts.curves import SelfMotionCurves
-from orthocas.charts.descent import RULES, BoxedPhi
+from orthocas.charts.descent import RULES, BoxedPhi, InDomain
 from orthocas.charts.inside import Inside
 from orthocas.charts.inverse import Inverse
-from orthocas.charts.motion_kernel import MotionKernel, SearchKernel, has_library
 from orthocas.charts.newton import (
     NEWTON,
     Continuation,
+    Differences,
     FewRows,
     Newton,
     OwnInverse,
+    PhiMap,
     PointFunctions,
+    Starts,
     inverse_function,
 )
-from orthocas.charts.phi import Differences, PhiMap, fill_coordinates, leave_over
-from orthocas.charts.search import InDomain, Starts
-from orthocas.charts.trackers import near_function
+from orthocas.charts.trackers import leave_over, near_function
 from orthocas.tasks.problem import measure_task_sizes
 from orthocas.tasks.relative import Relative
 from orthocas.tasks.samples import sample_uniform
@@ -201,14 +201,15 @@ class ChartParts:
         # grown coordinates bring their own inverse
         starts = Starts(phi_map, domain)
         if isinstance(chart.coordinates, InvertibleMap):
-            return Inverse(chart.problem, phi_map, OwnInverse(chart.coordinates, phi_map), starts)
+            own = OwnInverse(chart.coordinates, phi_map)
+            return Inverse(chart.problem, phi_map, own, own, starts)
         boxed = self.boxed
         local, brief = (
             FewRows(phi_map, self.point_functions, Newton(phi_map, k)) for k in (NEWTON.halvings, NEWTON.brief)
         )
         in_domain, inside = InDomain(boxed, starts), Inside(boxed, starts)
         curves = SelfMotionCurves(boxed, starts, self.tracer, SearchKernel(chart)) if chart.r == 1 else None
-        return Inverse(chart.problem, phi_map, local, starts, Continuation(phi_map), in_domain, inside, curves, brief)
+        return Inverse(chart.problem, phi_map, local, brief, starts, Continuation(phi_map), in_domain, inside, curves)
 
     @cached_property
     def point_functions(self) -> PointFunctions:

@@ -417,11 +417,6 @@ def laguerre(diagonal: ca.SX, squares: ca.SX, at: ca.SX, steps: int) -> tuple[ca
     return at, step
 
 
-def unfinished(last_steps: Array) -> NDArray[np.bool_]:
-    """Where the last step of `laguerre` was more than rounding."""
-    return np.asarray(last_steps > _ROUNDING)
-
-
 def judge_by_columns(samples: Samples, J: Array) -> dict[str, Array]:
     """Like `judge`, for enough samples to fill columns. Without metric_mutual_cosines if A is the identity."""
     (N, r, n), inverse = J.shape, samples.metric_inverse
@@ -430,15 +425,15 @@ def judge_by_columns(samples: Samples, J: Array) -> dict[str, Array]:
         data.append(inverse.reshape(N, -1))
     function, sizes = _function(n - r, n, inverse is None)
     rows = _evaluated(function, sum(sizes.values()), data)
-    # samples that need more steps go on with the search for the smallest eigenvalue
-    left = np.flatnonzero(unfinished(rows[:, -1]))
+    # samples whose last step was more than rounding go on with the search for the smallest eigenvalue
+    left = np.flatnonzero(rows[:, -1] > _ROUNDING)
     for _ in range(_MOST_ROUNDS):
         if not left.size:
             break
         some = [array[left] for array in data]
         some[2] = rows[left, -2:-1]
         rows[left] = _evaluated(function, rows.shape[1], some)
-        left = left[unfinished(rows[left, -1])]
+        left = left[rows[left, -1] > _ROUNDING]
     found = dict(zip(sizes, np.split(rows, np.cumsum(list(sizes.values()))[:-1], axis=1), strict=True))
     del found["last_step"]
     conditioning = np.sqrt(found.pop("eigenvalue")[:, 0])

@@ -14,6 +14,7 @@ from orthocas.charts.chart import Chart
 from orthocas.charts.chart_file import FREE
 from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.point_quality import Judged, WorstPoints, measure_held_speeds, pairs, worst_points
+from orthocas.charts.walls import require_collisions
 from orthocas.errors import InvalidValueError, SingularTaskError
 from orthocas.robots.collisions import Collisions
 from orthocas.tasks.samples import evaluate_samples, find_idle_joints, sample_uniform
@@ -87,9 +88,7 @@ def evaluate(
         2
     """
     require_kind("chart", chart, Chart)
-    if collisions is not None:
-        require_kind("collisions", collisions, Collisions)
-        collisions.require_for(chart.problem.robot.tree)
+    require_collisions(collisions, chart.problem.robot.tree)
     free = FREE in chart.notes
     if free and collisions is None:
         collisions = chart.problem.robot.collisions

@@ -69,20 +69,18 @@ class Card(Shown):
         folder = files(__package__) / "licences"
         return "\n".join((folder / f"{name}.txt").read_text("utf-8") for name in ("NOTICE", self.model.licence))
 
-    def _of_the_domain(self) -> dict[str, str]:
-        if not self.branch:
-            return {"proof": f"no fold anywhere on the domain, {self.proved_parts} parts"}
-        share = percent(self.regular_share, 2)
-        return {
-            "branch": f"{self.branch}; regular on {share} of its clear positions, and the domain is this part",
-            "proof": "none in the file: the domain leaves folds out, and laws and C test it at every tick",
-        }
-
     def facts(self) -> dict[str, str]:
         """Quality, domain, proof, and where the chart comes from."""
         quality, model = self.quality, self.model
         extra = "1 extra coordinate" if quality["r"] == 1 else f"{quality['r']} extra coordinates"
         cyclic = {"cyclic": f"holds at all positions of {listed(self.cyclic_joints)}"} if self.cyclic_joints else {}
+        proof = {"proof": f"no fold anywhere on the domain, {self.proved_parts} parts"}
+        if self.branch:
+            share = percent(self.regular_share, 2)
+            proof = {
+                "branch": f"{self.branch}; regular on {share} of its clear positions, and the domain is this part",
+                "proof": "none in the file: the domain leaves folds out, and laws and C test it at every tick",
+            }
         angles, leak, conditioning = quality["task_angle_deg"], quality["leak_deg"], quality["conditioning"]
         return {
             "card": f"{self.name}, {model.robot}, {quality['n']} joints, {extra}",
@@ -92,7 +90,7 @@ class Card(Shown):
             "conditioning": f"mean {conditioning['mean']:.3f}, least {conditioning['min']:.3f}",
             "domain": f"half-width {number_list(self.half_width)} around {number_list(self.centre)}",
             **cyclic,
-            **self._of_the_domain(),
+            **proof,
             "model": f"{model.file} of {model.package}; {model.licence}, {model.holder}",
             "samples": f"{quality['samples']} held out, seed {quality['seed']}",
             "coordinates": self.coordinates,

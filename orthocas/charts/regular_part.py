@@ -10,8 +10,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from orthocas.bases.family import JointSpace
-from orthocas.bases.registry import parametrisation_from_data, parametrisation_to_data
+from orthocas.bases.family import JointSpace, parametrisation_from_data, parametrisation_to_data
 from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.point_quality import triangle
 from orthocas.errors import DomainError, InvalidValueError

@@ -11,15 +11,13 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
-from orthocas.charts.curve_tracer import solutions_of
-from orthocas.charts.motion_kernel import ENDLESS, FOLD, SINGULAR, WALL
-from orthocas.charts.newton import Newton
-from orthocas.charts.phi import counted_on, largest, require_no_turns
+from orthocas.charts.curve_tracer import ENDLESS, FOLD, SINGULAR, WALL, solutions_of
+from orthocas.charts.newton import Newton, largest
+from orthocas.charts.walls import Stop, Walls
 from orthocas.errors import InvalidValueError, degrees_hint
 from orthocas.robots.collisions import Collisions
-from orthocas.tasks.domains import StopKind, Wall
-from orthocas.tasks.problem import Problem
-from orthocas.tools.checks import Array, Indices, as_number, as_point, freeze_array, require_count, require_kind
+from orthocas.tasks.domains import StopKind
+from orthocas.tools.checks import Array, Indices, as_number, as_point, freeze_array, require_count
 from orthocas.tools.display import Shown, listed, number_list
 from orthocas.tools.expressions import wrap_shortest
 
@@ -31,7 +29,6 @@ if TYPE_CHECKING:
 class SelfMotionRules:
     """Numbers of ranges and self-motions."""
 
-    at_limit: float = 1e-9  #: half-widths: boundaries closer to a joint limit are that limit
     step: float = 0.4  #: longest step along a curve [rad] or [m]
     shortest: float = 1e-6  #: a curve that needs shorter ones ends [rad] or [m]
     missed: float = 0.08  #: largest correction of the longest step [rad] or [m]; of shorter ones as much less
@@ -47,8 +44,6 @@ class SelfMotionRules:
     spacing: float = 0.1  #: of points on the curves of ranges [rad] or [m]
     phi_tolerance: float = 1e-10  #: of phi, relative to `ChartParts.phi_sizes`
     farthest: float = 3.0  #: distance of a point from its neighbour, in lengths of the predicted step
-    grazing: float = 1e-4  #: [rad] or [m]: shorter steps are not checked for contacts between their ends
-    depth: float = 1e-4  #: [m] of contacts that may be passed between two steps
     most: int = 4  #: times as many points as wanted, at most
 
 
@@ -104,27 +99,26 @@ def start_inside(chart: Chart, q: ArrayLike, collisions: Collisions | None = Non
 
 def _curve(chart: Chart, q: Array, step: float, collisions: Collisions | None) -> SelfMotionCurve:
     """Both directions of the curve; the coordinate rises at q."""
-    up = branch_along(chart, q, 0, 1, collisions, step, folds=False)
-    # a curve that closes is found in one direction
-    down = up.start if up.endless else branch_along(chart, q, 0, -1, collisions, step, folds=False)
-    points = np.concatenate([down.q[:0:-1], up.q])
+    down, up, place, points, arc_length = _follow_both(chart, q, 0, collisions, step, folds=False)
     # along the curve, xi may turn back, so its least and largest values need not be at the ends
     xi = counted_on(np.concatenate([down.xi[:0:-1], up.xi]), chart.parts.turns[chart.m :])
     rises = np.sign(np.diff(xi[:, 0]))
     low, high = (down, up) if xi[0, 0] <= xi[-1, 0] else (up, down)
-    place = len(down.q) - 1
     least, most = (_find_extreme(chart, points, xi[:, 0], sign, up.endless, collisions) for sign in (-1, 1))
     ends = Interval(chart.labels[-1], float(xi[place, 0]), least, most, low.stop, high.stop)
-    return SelfMotionCurve(
-        chart.x(q),
-        points,
-        xi,
-        place,
-        XiRange((ends,)),
-        np.concatenate([-down.arc_length[:0:-1], up.arc_length]),
-        up.endless,
-        int(np.count_nonzero(np.diff(rises[rises != 0]))),
-    )
+    turns = int(np.count_nonzero(np.diff(rises[rises != 0])))
+    return SelfMotionCurve(chart.x(q), points, xi, place, XiRange((ends,)), arc_length, up.endless, turns)
+
+
+def _follow_both(
+    chart: Chart, q: Array, k: int, collisions: Collisions | None, spacing: float, folds: bool
+) -> tuple[Branch, Branch, int, Array, Array]:
+    """Both directions of a curve, down and up; of the whole curve the row of q, points (N, n) and arc lengths (N,)."""
+    up = branch_along(chart, q, k, 1, collisions, spacing, folds)
+    # a curve that closes is found in one direction
+    down = up.start if up.endless else branch_along(chart, q, k, -1, collisions, spacing, folds)
+    points = np.concatenate([down.q[:0:-1], up.q])
+    return down, up, len(down.q) - 1, points, np.concatenate([-down.arc_length[:0:-1], up.arc_length])
 
 
 def _find_extreme(
@@ -145,11 +139,44 @@ def _find_extreme(
 
 
 def _set(chart: Chart, q: Array, samples: int, collisions: Collisions | None) -> SelfMotion:
-    """Points on a lattice in xi, and the extent from its outermost points on."""
-    require_no_turns(chart.labels, chart.parts.turns, "a set of self-motions")
-    # the ranges at q size the lattice; its own outermost points may reach farther
-    alone = xi_range(chart, q, collisions)
-    points = filled(chart, q, alone, samples, collisions)
+    """About `samples` points on a lattice in xi, filled from q on, and the extent from its outermost points on."""
+    circles = [label for label, turn in zip(chart.labels, chart.parts.turns, strict=True) if turn > 0]
+    if circles:
+        came = f"one with circle-valued coordinates ({', '.join(circles)})"
+        raise InvalidValueError("chart", came, "real-valued ones for a set of self-motions")
+    # the ranges at q size the lattice around xi(q); a full turn of coordinates without ends
+    alone, cells = xi_range(chart, q, collisions), max(2, round(samples ** (1 / chart.r)))
+    span = alone.high - alone.low
+    spacing = np.where(np.isfinite(span) & (span > 0), span, 2 * np.pi) / cells
+    known: dict[tuple[int, ...], Array] = {(0,) * chart.r: q}
+    front, tried = list(known), set(known)
+    start, phi_map = chart.phi(q), chart.parts.phi_map
+    sign, newton = np.sign(np.linalg.det(phi_map.jacobian(q[None])[0])), Newton(phi_map)
+    while front and len(known) < RULES.most * samples:
+        # the neighbours of all points of the last round that were not tried before
+        pairs = []
+        for origin, axis, move in product(front, range(chart.r), (-1, 1)):
+            place = (*origin[:axis], origin[axis] + move, *origin[axis + 1 :])
+            if place not in tried and abs(place[axis]) <= 2 * cells:
+                tried.add(place)
+                pairs.append((origin, place))
+        if not pairs:
+            break
+        # solved together, by Newton's method from their neighbours
+        targets, starts = np.tile(start, (len(pairs), 1)), np.array([known[origin] for origin, _ in pairs])
+        targets[:, chart.m :] += np.array([place for _, place in pairs]) * spacing
+        found, gap = newton(targets, starts), phi_map.difference(targets, phi_map.phi(starts))
+        # far from its neighbour, or where det J has the other sign, a point is on another sheet
+        step = np.linalg.solve(phi_map.jacobian(starts), gap[..., None])[..., 0]
+        near = np.linalg.norm(found.q - starts, axis=1) <= RULES.farthest * np.linalg.norm(step, axis=1) + 1e-9
+        solved = (largest(found.residual) < RULES.phi_tolerance) & near & chart.problem.domain.contains(found.q)
+        good = np.flatnonzero(solved)
+        good = good[np.sign(np.linalg.det(phi_map.jacobian(found.q[good]))) == sign]
+        good = good if collisions is None else good[collisions.check_free(found.q[good])]
+        # those that were found are the front of the next round
+        front = [pairs[row][1] for row in good]
+        known.update(zip(front, found.q[good], strict=True))
+    points = np.array(list(known.values()))
     xi = chart.xi(points)
     widest = tuple(_widest(chart, points, xi, alone[k], k, collisions) for k in range(chart.r))
     return SelfMotion(chart.x(q), points, xi, 0, XiRange(widest))
@@ -163,64 +190,6 @@ def _widest(chart: Chart, points: Array, xi: Array, alone: Interval, k: int, col
     up = branch_along(chart, points[np.argmax(xi[:, k])], k, 1, collisions)
     low, high = (float(branch.xi[-1, k]) for branch in (down, up))
     return Interval(alone.label, alone.here, low, high, down.stop, up.stop)
-
-
-def filled(chart: Chart, q: Array, alone: XiRange, samples: int, collisions: Collisions | None = None) -> Array:
-    """Joint positions (N, n) with the task value of q (n,), inside the domain and free, q first.
-
-    Their coordinates lie on a lattice around xi(q). Its spacing divides the range of each coordinate alone so that
-    about `samples` points result. The fill goes from point to neighbour, so that all points can be reached from q.
-    """
-    cells = max(2, round(samples ** (1 / chart.r)))
-    # a full turn of coordinates without ends
-    span = alone.high - alone.low
-    spacing = np.where(np.isfinite(span) & (span > 0), span, 2 * np.pi) / cells
-    known: dict[tuple[int, ...], Array] = {(0,) * chart.r: q}
-    front, tried = list(known), set(known)
-    start, sign = chart.phi(q), np.sign(np.linalg.det(chart.parts.batched_rates(q[None])[0]))
-    # the neighbours of all points of the last round, solved together
-    while front and len(known) < RULES.most * samples:
-        pairs = _neighbours(front, tried, cells)
-        if not pairs:
-            break
-        places = np.array([place for _, place in pairs])
-        targets = np.tile(start, (len(pairs), 1))
-        targets[:, chart.m :] += places * spacing
-        found, good = _solved(chart, np.array([known[origin] for origin, _ in pairs]), targets, float(sign))
-        good = good if collisions is None else good[collisions.check_free(found[good])]
-        # those that were found are the front of the next round
-        front = [pairs[row][1] for row in good]
-        known.update(zip(front, found[good], strict=True))
-    return np.array(list(known.values()))
-
-
-def _neighbours(
-    front: list[tuple[int, ...]], tried: set[tuple[int, ...]], cells: int
-) -> list[tuple[tuple[int, ...], tuple[int, ...]]]:
-    """Pairs of a point and a neighbour of it that was not tried before."""
-    pairs = []
-    for origin, axis, move in product(front, range(len(front[0])), (-1, 1)):
-        place = (*origin[:axis], origin[axis] + move, *origin[axis + 1 :])
-        if place not in tried and abs(place[axis]) <= 2 * cells:
-            tried.add(place)
-            pairs.append((origin, place))
-    return pairs
-
-
-def _solved(chart: Chart, starts: Array, targets: Array, sign: float) -> tuple[Array, Indices]:
-    """Newton's method from all starts (N, n), and the rows where it found a point of the domain on the same sheet."""
-    phi_map = chart.parts.phi_map
-    found = Newton(phi_map)(targets, starts)
-    # far from its neighbour, a point is on another sheet
-    step = np.linalg.solve(phi_map.jacobian(starts), phi_map.difference(targets, phi_map.phi(starts))[..., None])[
-        ..., 0
-    ]
-    near = np.linalg.norm(found.q - starts, axis=1) <= RULES.farthest * np.linalg.norm(step, axis=1) + 1e-9
-    rows = np.flatnonzero(
-        (largest(found.residual) < RULES.phi_tolerance) & near & chart.problem.domain.contains(found.q)
-    )
-    same = np.sign(np.linalg.det(phi_map.jacobian(found.q[rows]))) == sign
-    return found.q, np.asarray(rows[same], dtype=np.int64)
 
 
 def branch_along(
@@ -258,12 +227,21 @@ def branch_along(
 
         return LevelCurve(chart, held, spacing, collisions).follow(q, gradient, rise if folds else None)
     # Which boundary stops the way is asked just beyond it.
-    if way.stop == WALL:
+    points, xi, length, end, beyond = way
+    if end == WALL:
         walls = Walls(chart.problem)
-        stop = walls.stop(int(np.argmin(walls.values(way.beyond))), way.q[-1])
+        stop = walls.stop(int(np.argmin(walls.values(beyond))), points[-1])
     else:
-        stop = Stop({ENDLESS: StopKind.ENDLESS, SINGULAR: StopKind.SINGULAR, FOLD: StopKind.FOLD}[way.stop])
-    return Branch(way.q, way.length, stop, way.xi[:, None])
+        stop = Stop({ENDLESS: StopKind.ENDLESS, SINGULAR: StopKind.SINGULAR, FOLD: StopKind.FOLD}[end])
+    return Branch(points, length, stop, xi[:, None])
+
+
+def counted_on(rows: Array, turns: Array) -> Array:
+    """Values along a curve (N, k), continuous: periodic ones are continued by the shorter way from row to row."""
+    if not turns.any():
+        return rows
+    steps = wrap_shortest(np.diff(rows, axis=0), turns)
+    return np.asarray(rows[0] + np.concatenate([np.zeros((1, rows.shape[1])), np.cumsum(steps, axis=0)]))
 
 
 def too_far(chart: Chart, q: Array, wanted: Array) -> str:
@@ -284,11 +262,7 @@ def too_far(chart: Chart, q: Array, wanted: Array) -> str:
 
 def fan_along(chart: Chart, q: Array, k: int) -> Fan:
     """The fan of the k-th coordinate at a joint position (n,) inside the domain."""
-    down, up = branch_along(chart, q, k, -1), branch_along(chart, q, k, 1)
-    if down.endless:  # then one direction passes everything
-        down = down.start
-    points = np.concatenate([down.q[:0:-1], up.q])
-    arc_length = np.concatenate([-down.arc_length[:0:-1], up.arc_length])
+    down, up, _, points, arc_length = _follow_both(chart, q, k, None, RULES.spacing, folds=True)
     xi = np.concatenate([down.xi[:0:-1], up.xi])[:, k]
     turn = getattr(chart.coordinates, "turn", 0.0)
     xi = np.unwrap(xi, period=turn) if turn else xi
@@ -371,39 +345,42 @@ class LevelCurve:
                 break
         assert stop is not None
         q, t = np.concatenate(points), np.concatenate(tangents)
-        return Branch(q, np.concatenate([[0.0], np.cumsum(_measure_arcs(q, t))]), stop, self._chart.xi(q))
+        # arcs by chords and angles a between the tangents at their ends: chord (a / 2) / sin(a / 2)
+        half = np.arccos(np.clip((t[:-1] * t[1:]).sum(axis=1), -1.0, 1.0)) / 2
+        arcs = np.linalg.norm(np.diff(q, axis=0), axis=1) / np.sinc(half / np.pi)
+        return Branch(q, np.concatenate([[0.0], np.cumsum(arcs)]), stop, self._chart.xi(q))
 
     def _step_on(self, target: Array, q: Array, t: Array) -> Iterator[tuple[Array, Array, Stop | None]]:
         """Points (n,) and tangents of long steps from q (n,) along t, near the curve, and at last what ended it."""
-        start, bend, h, length, count, stop = (q, t), np.zeros(len(q)), RULES.step / 2, 0.0, 0, None
+        start, t_start, bend, h, length, count, stop = q, t, np.zeros(len(q)), RULES.step / 2, 0.0, 0, None
         while stop is None:
-            found = self._correct_step(target, q, t, q + h * t + h**2 / 2 * bend)
-            # a step that misses the curve is halved
-            if found is None:
+            # the point of the curve next to one ahead; a step that misses the curve is halved
+            ahead = q + h * t + h**2 / 2 * bend
+            change, onward = (part[0] for part in self._correct(target, ahead[None], t[None]))
+            missed, size = float(np.linalg.norm(change)), float(np.linalg.norm(ahead - q))
+            good = missed < RULES.missed * min(1.0, size / RULES.step) and onward @ t > RULES.sharpest
+            if good:
+                # What is left of an error would stand beside the next step, however short that becomes.
+                new, onward = self._settle(target, ahead + change, onward)
+                good = np.isfinite(new).all()
+            if not good:
                 h /= 2
                 if h < RULES.shortest:
                     yield q, t, Stop(StopKind.SINGULAR)
                     return
                 continue
-            new, onward = found
-            if count > 2 and (closing := self._return_to_start(target, q, new, onward, *start)) is not None:
-                (new, onward), stop = closing, Stop(StopKind.ENDLESS)
+            # a step that passes the start, up to full turns, ends there
+            before, after = (self.walls.gap(point, start) for point in (q, new)) if count > 2 else (t_start, t_start)
+            if before @ t_start < 0 <= after @ t_start and np.linalg.norm(after) <= 1.6 * RULES.step:
+                passed = self._settle(target, new - (after @ t_start) * onward, onward)[0]
+                if np.linalg.norm(self.walls.gap(passed, start)) < RULES.same:
+                    new, onward, stop = start + (new - start - after), t_start, Stop(StopKind.ENDLESS)
             # curvature and length for the next step
             length, count, turned = length + float(np.linalg.norm(new - q)), count + 1, float(onward @ t)
             bend = (onward - t) / h
             q, t, h = new, onward, min(1.6 * h, RULES.step) if turned > RULES.straight else h
             stop = Stop(StopKind.ENDLESS) if length > RULES.longest else stop
             yield q, t, stop
-
-    def _correct_step(self, target: Array, q: Array, t: Array, ahead: Array) -> tuple[Array, Array] | None:
-        """The point of the curve next to one ahead (n,) of q (n,), and its tangent; None if that is too far to tell."""
-        change, onward = (part[0] for part in self._correct(target, ahead[None], t[None]))
-        missed, h = float(np.linalg.norm(change)), float(np.linalg.norm(ahead - q))
-        if not (missed < RULES.missed * min(1.0, h / RULES.step) and onward @ t > RULES.sharpest):
-            return None
-        # What is left of an error would stand beside the next step, however short that becomes.
-        point, tangent = self._settle(target, ahead + change, onward)
-        return (point, tangent) if np.isfinite(point).all() else None
 
     def _correct(self, target: Array, q: Array, t: Array) -> tuple[Array, Array]:
         """Newton's steps (N, n) from points q (N, n) across directions t (N, n), and unit tangents, on their side."""
@@ -509,24 +486,6 @@ class LevelCurve:
             if not np.abs(change).max() >= RULES.settled:
                 break
         return q, onward
-
-    def _return_to_start(
-        self, target: Array, q: Array, new: Array, onward: Array, start: Array, t: Array
-    ) -> tuple[Array, Array] | None:
-        """The start, up to full turns, and its tangent t, if the step from q (n,) to a new point passes it."""
-        before, after = (self.walls.gap(point, start) for point in (q, new))
-        if not before @ t < 0 <= after @ t or np.linalg.norm(after) > 1.6 * RULES.step:
-            return None
-        passed = self._settle(target, new - (after @ t) * onward, onward)[0]
-        return (
-            (start + (new - start - after), t) if np.linalg.norm(self.walls.gap(passed, start)) < RULES.same else None
-        )
-
-
-def _measure_arcs(q: Array, t: Array) -> Array:
-    """Lengths of arcs (K,) by chords and angles a between the tangents at their ends: chord (a / 2) / sin(a / 2)."""
-    half = np.arccos(np.clip((t[:-1] * t[1:]).sum(axis=1), -1.0, 1.0)) / 2
-    return np.asarray(np.linalg.norm(np.diff(q, axis=0), axis=1) / np.sinc(half / np.pi))
 
 
 @dataclass(frozen=True, repr=False)
@@ -663,109 +622,3 @@ class SelfMotionCurve(SelfMotion):
 
 def _extents(extent: XiRange) -> dict[str, str]:
     return {name: text for name, text in extent.facts().items() if name != "reach"}
-
-
-@dataclass(frozen=True)
-class Stop:
-    """What ends a motion, and where."""
-
-    kind: StopKind
-    joint: str = ""  #: name of the joint, for JOINT
-    value: float = np.nan  #: position of that joint [rad] or [m], or what a condition of the domain bounds
-    is_limit: bool = False  #: whether the boundary of the domain is the limit of the joint
-    condition: str = ""  #: in one line, for conditions of the domain; the pair, for contacts
-
-    def __str__(self) -> str:
-        if self.kind is StopKind.JOINT:
-            return f"joint '{self.joint}' at {self.value:.4g}{', its limit' if self.is_limit else ''}"
-        if self.kind is StopKind.NEAR_SINGULAR:
-            return f"the task near singular, with a relative singular value of {self.value:.3g}"
-        if self.kind is StopKind.CONDITION:
-            return f"the boundary of the domain ({self.condition})"
-        if self.kind is StopKind.CONTACT:
-            return f"a contact of {self.condition}"
-        return {
-            StopKind.FOLD: "a fold of the chart",
-            StopKind.SINGULAR: "a singularity or the end of the chart",
-            StopKind.ENDLESS: "nothing",
-        }[self.kind]
-
-    @property
-    def brief(self) -> str:
-        """The same in a few words."""
-        if self.kind is StopKind.JOINT:
-            return f"{self.joint} at {'its limit ' if self.is_limit else ''}{self.value:.4g}"
-        return {
-            StopKind.NEAR_SINGULAR: "the task near singular",
-            StopKind.CONDITION: self.condition,
-            StopKind.CONTACT: f"a contact of {self.condition}",
-            StopKind.FOLD: "a fold",
-            StopKind.SINGULAR: "a singularity",
-            StopKind.ENDLESS: "no end",
-        }[self.kind]
-
-
-class Walls:
-    """The boundaries of a problem's domain as functions that are positive inside.
-
-    They are (q_i - low_i) and (high_i - q_i), divided by the half-width of the domain, for every joint; then what the
-    domain itself names as its `walls`; then the distance to a contact, if there are solids to hit.
-    """
-
-    def __init__(self, problem: Problem, collisions: Collisions | None = None) -> None:
-        domain = problem.domain
-        self._domain, self._robot, self._collisions = domain, problem.robot, collisions
-        self._low, self._high = domain.bounds
-        self.solid = collisions is not None  #: whether there is something to hit
-        self._curved = domain.walls
-        if collisions is not None:
-            require_kind("collisions", collisions, Collisions)
-            collisions.require_for(problem.robot.tree)
-            self._curved = (*domain.walls, Wall(StopKind.CONTACT, lambda q: float(collisions.distance(q).distance)))
-        endless = np.isinf(self._low) & ~np.array(problem.robot.tree.prismatic)
-        self.turning = endless  #: unbounded revolute joints, (n,): they are at the same place after a full turn
-
-    def values(self, q: Array) -> Array:
-        """All functions at one joint position (n,), positive inside; infinite for unbounded joints."""
-        width = self._domain.half_width
-        rooms = np.array([wall.room(q) for wall in self._curved])
-        parts = [(q - self._low) / width, (self._high - q) / width, np.where(np.isfinite(rooms), rooms, -1.0)]
-        return np.concatenate(parts)
-
-    def box_has(self, q: Array) -> bool:
-        """Whether q (n,) lies in the box of the domain."""
-        return bool(((q >= self._low) & (q <= self._high)).all())
-
-    def stop(self, k: int, q: Array) -> Stop:
-        """What the k-th function stands for, at q (n,)."""
-        n = len(q)
-        if k >= 2 * n:
-            wall = self._curved[k - 2 * n]
-            if wall.kind is StopKind.CONTACT and self._collisions is not None:
-                first, second = self._collisions.distance(q).pair
-                return Stop(wall.kind, condition=f"'{first}' and '{second}'")
-            value = np.nan if wall.value is None else float(wall.value(q))
-            return Stop(wall.kind, value=value, condition=wall.heading)
-        i = k % n
-        boundary, limit = (self._low, self._robot.lower) if k < n else (self._high, self._robot.upper)
-        at_limit = bool(abs(boundary[i] - limit[i]) <= RULES.at_limit * self._domain.half_width[i])
-        return Stop(StopKind.JOINT, self._robot.joint_names[i], float(boundary[i]), at_limit)
-
-    def may_touch(self, q: Array, t: Array, new: Array, onward: Array) -> bool:
-        """Whether a contact deeper than a tolerance may lie on an arc between joint positions (n,) with end tangents.
-
-        An arc whose tangent turns by an angle a is no farther from its chord c than (c / 2) tan(a / 2).
-        """
-        chord = float(np.linalg.norm(new - q))
-        if self._collisions is None or chord < RULES.grazing:
-            return False
-        bend = chord / 2 * float(np.tan(np.arccos(np.clip(t @ onward, 0.0, 1.0)) / 2))
-        return self._collisions.find_contact(np.array([q, new]), -RULES.depth, bend) is not None
-
-    def worst(self, q: Array) -> Stop:
-        """The boundary that q (n,) has crossed farthest, or is nearest to."""
-        return self.stop(int(np.argmin(self.values(q))), q)
-
-    def gap(self, q: Array, start: Array) -> Array:
-        """q - start (n,), up to full turns of unbounded revolute joints."""
-        return np.asarray(wrap_shortest(q - start, 2 * np.pi * self.turning))

@@ -10,11 +10,10 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.charts.clearance import RULES as CLEARANCE
-from orthocas.charts.clearance import Clearance
 from orthocas.charts.descent import rooms_of
-from orthocas.charts.newton import NEWTON, Bound, PointFunctions, PointSolver
-from orthocas.charts.phi import PhiMap, leave_over
+from orthocas.charts.newton import NEWTON, Bound, PhiMap, PointFunctions, PointSolver
+from orthocas.charts.walls import RULES as CLEARANCE
+from orthocas.charts.walls import Clearance
 from orthocas.errors import InvalidValueError, degrees_hint
 from orthocas.tasks.domains import Domain
 from orthocas.tools.batch import dense_function
@@ -97,6 +96,7 @@ class Tracker(Shown):
         if not (limit > 0).all():
             raise InvalidValueError("largest_step", limit.tolist(), "positive numbers")
         self._limit = np.broadcast_to(limit, n)
+        self._parts: tuple[Any, ...] = functions, domain, self._limit, m, clearance  # what makes another one
         self._solver = PointSolver(functions)
         self._before, self._guarded = np.empty(n), np.empty(2)
         with deferred(), building:  # CasADi's expressions are not for several threads at a time
@@ -106,13 +106,11 @@ class Tracker(Shown):
 
     def __getstate__(self) -> dict[str, Any]:
         """Without scratch memory."""
-        parts: dict[str, Any] = {"functions": self._functions, "domain": self._domain, "q": self.q}
-        parts |= {"limit": self._limit, "m": self._m, "clearance": self._clearance, "start": self._start}
-        return {**parts, "target": self._solver.target}
+        return {"parts": self._parts, "q": self.q, "start": self._start, "target": self._solver.target}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        names = ("functions", "domain", "q", "limit", "m", "clearance")
-        self.__init__(*(state[name] for name in names))  # type: ignore[misc]
+        functions, domain, *others = state["parts"]
+        self.__init__(functions, domain, state["q"], *others)  # type: ignore[misc]
         self._start, self._solver.target[:] = state["start"], state["target"]
 
     @property
@@ -270,7 +268,10 @@ class Tracker(Shown):
             if error <= NEWTON.goal or (error <= TRACKER.rounded and not falls):
                 self._guard.run()
                 solver.accept()
-                return self._allowed()
+                jump, outside = self._guarded.tolist()
+                if outside > 0:
+                    return TrackerStatus.OUTSIDE_DOMAIN
+                return TrackerStatus.JUMP if jump > 1 else TrackerStatus.OK
             # far away, shorter steps lead to where whole ones converge
             if falls or (fresh and solver.shorten()):
                 solver.accept()
@@ -281,22 +282,9 @@ class Tracker(Shown):
                 return TrackerStatus.SINGULAR
         return TrackerStatus.LOST if np.isfinite(solver.target).all() else TrackerStatus.BAD_INPUT
 
-    def _allowed(self) -> TrackerStatus:
-        """Whether the step that the guard looked at is allowed."""
-        jump, outside = self._guarded.tolist()
-        if outside > 0:
-            return TrackerStatus.OUTSIDE_DOMAIN
-        return TrackerStatus.JUMP if jump > 1 else TrackerStatus.OK
-
 
 #: with these, q has moved
-_MOVED = (
-    TrackerStatus.OK,
-    TrackerStatus.NEAREST,
-    TrackerStatus.NEARER,
-    TrackerStatus.YIELDING,
-    TrackerStatus.BRAKED,
-)
+_MOVED = tuple(TrackerStatus[name] for name in ("OK", "NEAREST", "NEARER", "YIELDING", "BRAKED"))
 
 
 def _guard(domain: Domain, limit: Array) -> ca.Function:
@@ -306,6 +294,16 @@ def _guard(domain: Domain, limit: Array) -> ca.Function:
     if domain.condition is not None:
         outside = ca.fmax(outside, ca.if_else(ca.mmin(domain.condition.pivots(q)) > 0, -1, 1))
     return dense_function("guard", [before, q], [ca.vertcat(ca.norm_inf((q - before) / ca.DM(limit)), outside)])
+
+
+def leave_over(apart: float, tolerance: float, change: Array, turning: tuple[int, ...]) -> Array | None:
+    """What a loop leaves over in the joints: their change (n,), less full turns of those that turn without end.
+
+    None if phi at its ends differs by more than the tolerance, relative to the sizes of the components.
+    """
+    turns = np.zeros(len(change))
+    turns[list(turning)] = 2 * np.pi
+    return None if apart > tolerance else np.asarray(wrap_shortest(change, turns))
 
 
 @dataclass(frozen=True, slots=True)
@@ -362,23 +360,14 @@ class ReachingTracker(Tracker):
         clearance: Clearance | None,
         near: ca.Function,
     ) -> None:
-        self._parts = near
         super().__init__(functions, domain, q0, largest_step, m, clearance)
+        self._parts = (*self._parts, near)
         n, rooms = len(domain.centre), near.size1_out(2)
         self._at, self._to, self._e, self._rooms = np.empty(n), np.empty(n), np.empty(n), np.empty(rooms)
         self._J, self._slopes = np.empty((n, n)), np.empty((n, rooms))
         self._near = Bound(near, [self._at, self._to], [self._e, self._J, self._rooms, self._slopes])
         self._width, ends = domain.half_width, domain.reach - RULES.joint_room * domain.half_width
         self._low, self._high = domain.centre - ends, domain.centre + ends
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Without scratch memory."""
-        return {**super().__getstate__(), "near": self._parts}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        names = ("functions", "domain", "q", "limit", "m", "clearance", "near")
-        self.__init__(*(state[name] for name in names))  # type: ignore[misc]
-        self._start, self._solver.target[:] = state["start"], state["target"]
 
     def step(self, phi: ArrayLike | None = None, *, x: ArrayLike | None = None, xi: ArrayLike | None = None) -> Array:
         """As `Tracker.step`; where that stays, the nearest q (n,) that a descent from the last one finds."""
@@ -428,7 +417,12 @@ class ReachingTracker(Tracker):
                 break
             new = self._inside(now, now.q + self._width * move, low, high)
             gain = (now.cost - new.cost) / promised
-            if gain > RULES.decrease and self._contains(new.q):
+            better = gain > RULES.decrease
+            if better:
+                self._solver.reached[:] = new.q
+                self._guard.run()
+                better = bool(self._guarded[1] <= 0)
+            if better:
                 now = new
                 damping *= 1 / RULES.shrinks if gain > 0.75 else 2.0 if gain < 0.25 else 1.0
             else:
@@ -449,12 +443,6 @@ class ReachingTracker(Tracker):
                 q = q + inwards * (2 * enough[k] - new.rooms[k]) / (now.slopes[k] @ inwards)
             new = self._look(np.clip(q, low, high))
         return new if (new.rooms >= enough).all() else new._replace(cost=np.inf)
-
-    def _contains(self, q: Array) -> bool:
-        """Whether q (n,) lies in the domain."""
-        self._solver.reached[:] = q
-        self._guard.run()
-        return bool(self._guarded[1] <= 0)
 
     def _look(self, q: Array) -> _Look:
         """Errors and rooms at q (n,)."""

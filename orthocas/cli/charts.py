@@ -15,16 +15,7 @@ from orthocas.charts import quality
 from orthocas.charts.certificate import METHODS
 from orthocas.charts.chart_file import CHART
 from orthocas.charts.ready import card, load, names
-from orthocas.cli.options import (
-    AsJson,
-    ChartPath,
-    DisabledPairs,
-    Force,
-    Solids,
-    parse_number,
-    parse_whole_number,
-    read_solids,
-)
+from orthocas.cli.options import AsJson, ChartPath, Force, Number, Solids, Whole, parse_whole_number, read_solids
 from orthocas.cli.output import (
     build_reach_data,
     format_reach_rows,
@@ -83,23 +74,13 @@ def charts(
 
 def evaluate(
     chart: ChartPath,
-    samples: Annotated[
-        int, typer.Option("--samples", parser=parse_whole_number, help="Number of held-out samples.")
-    ] = 100_000,
-    seed: Annotated[
-        int,
-        typer.Option(
-            "--seed", parser=parse_whole_number, help="Seed of the samples; use another one than for the fit."
-        ),
-    ] = 1,
+    samples: Annotated[int, Whole("--samples", help="Number of held-out samples.")] = 100_000,
     collisions: Solids = None,
-    srdf: DisabledPairs = None,
     json: AsJson = False,
 ) -> None:
     """Measure the quality of a chart on held-out samples of its domain."""
     loaded = load(chart)
-    solids = read_solids(loaded.problem.robot, collisions, srdf)
-    report = quality.evaluate(loaded, samples, seed, collisions=solids)
+    report = quality.evaluate(loaded, samples, collisions=read_solids(loaded.problem.robot, collisions))
     if json:
         print_json({**report.as_dict(), **build_reach_data(loaded)})
     else:
@@ -109,15 +90,9 @@ def evaluate(
 def certify(
     chart: ChartPath,
     bound: Annotated[
-        float | None,
-        typer.Option(
-            "--bound", parser=parse_number, help="Also prove that the conditioning is at least this; default: 0."
-        ),
+        float | None, Number("--bound", help="Also prove that the conditioning is at least this; default: 0.")
     ] = None,
-    seconds: Annotated[
-        float | None,
-        typer.Option("--seconds", parser=parse_number, help="Time limit; what is proved by then is kept."),
-    ] = None,
+    seconds: Annotated[float | None, Number("--seconds", help="Time limit; what is proved by then is kept.")] = None,
     check: Annotated[
         bool, typer.Option("--check", help="Check the certificate in the file, without a search.")
     ] = False,
@@ -125,8 +100,7 @@ def certify(
         Path | None, typer.Option("--out", help="Chart file to write, with the certificate; default: CHART itself.")
     ] = None,
     workers: Annotated[
-        str,
-        typer.Option("--workers", help="Number of processes, or the address of a Dask scheduler, tcp://host:8786."),
+        str, typer.Option("--workers", help="Number of processes, or the address of a Dask scheduler, tcp://host:8786.")
     ] = "1",
     force: Force = False,
     json: AsJson = False,

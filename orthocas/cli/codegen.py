@@ -9,22 +9,12 @@ import typer
 
 from orthocas.charts.chart import Chart
 from orthocas.charts.ready import load
-from orthocas.cli.options import (
-    AsJson,
-    ChartPath,
-    DisabledPairs,
-    Force,
-    Limit,
-    Solids,
-    parse_one_or_all,
-    read_solids,
-    spread_options,
-)
+from orthocas.cli.options import AsJson, ChartPath, Force, Limit, Solids, parse_one_or_all, read_solids, spread_options
 from orthocas.cli.output import note, print_json, print_rows
-from orthocas.codegen.check import AgreementCheck, check_c
+from orthocas.codegen.check import check_c
 from orthocas.codegen.export import LIBRARIES
 from orthocas.codegen.export import export as export_chart
-from orthocas.codegen.generate import GeneratedC, generate_c
+from orthocas.codegen.generate import generate_c
 from orthocas.control.controller import Controller, Setting, law_names, law_of
 from orthocas.errors import LawWarning, OptionError
 from orthocas.robots.capsules import fit_capsules
@@ -40,12 +30,13 @@ def add_law_options(for_codegen: bool) -> Callable[[Callable[..., None]], Callab
 
     The command gets those that were given, by name, as texts.
     """
-    options = {
-        name: Annotated[str | None, typer.Option(_name_option(name, setting), help=_describe_option(name, setting))]
-        for law in map(law_of, law_names())
-        for name, setting in law.options.items()
-        if for_codegen or not setting.codegen_only
-    }
+    options: dict[str, tuple[Any, None]] = {}
+    for law in map(law_of, law_names()):
+        for name, setting in law.options.items():
+            if for_codegen or not setting.codegen_only:
+                takers = _find_laws_with(name)
+                text = setting.help + ("" if len(takers) == len(law_names()) else f" For {', '.join(takers)}.")
+                options[name] = Annotated[str | None, typer.Option(_name_option(name, setting), help=text)], None
     return spread_options(
         "settings", options, lambda values: {name: text for name, text in values.items() if text is not None}
     )
@@ -53,11 +44,6 @@ def add_law_options(for_codegen: bool) -> Callable[[Callable[..., None]], Callab
 
 def _name_option(name: str, setting: Setting) -> str:
     return setting.option or f"--{name.replace('_', '-')}"
-
-
-def _describe_option(name: str, setting: Setting) -> str:
-    takers = _find_laws_with(name)
-    return setting.help + ("" if len(takers) == len(law_names()) else f" For {', '.join(takers)}.")
 
 
 def _find_laws_with(setting: str) -> list[str]:
@@ -82,7 +68,6 @@ def codegen(
         bool, typer.Option("--float", help="Numbers are float instead of double, for processors in single precision.")
     ] = False,
     collisions: Solids = None,
-    srdf: DisabledPairs = None,
     force: Force = False,
     json: AsJson = False,
 ) -> None:
@@ -103,7 +88,7 @@ def codegen(
         # Raises for grown charts.
         loaded.function("xi")
         law = None if controller == _NONE else build_controller(controller, loaded, settings, limit)
-        solids = read_solids(loaded.problem.robot, collisions, srdf)
+        solids = read_solids(loaded.problem.robot, collisions)
         capsules = None if solids is None else fit_capsules(solids)
         generated = generate_c(loaded, out, law, name, force, single_precision=single_precision, capsules=capsules)
         remarks = [] if law is None else [*law.remarks()]
@@ -112,11 +97,30 @@ def codegen(
         pairs = listed([f"{first} and {second}" for first, second in capsules.dropped])
         remarks.append(f"not checked in C, because their capsules touch in every posture tried: {pairs}")
     agreement = check_c(generated, loaded, law) if check else None
-    report = _build_report(generated, agreement)
+    # What was written, and how far it is from Python.
+    source = generated.folder / f"{generated.name}.c"
+    lines, differences = len(source.read_text().splitlines()), {} if agreement is None else agreement.differences
     if json:
+        report = {
+            "name": generated.name,
+            "source": str(source),
+            "lines": lines,
+            "stack_bytes": generated.stack_bytes,
+            "checked_states": None if agreement is None else agreement.states,
+            "compilers": None if agreement is None else list(agreement.compilers),
+            "relative_differences": None if agreement is None else differences,
+        }
         print_json(report)
     else:
-        print_rows(_format_rows(report), "" if check else f"cmake -S {out} -B {out}/build && cmake --build {out}/build")
+        rows = {"library": f"{generated.name}: {lines} lines of C99, {source}"}
+        rows["stack"] = f"{generated.stack_bytes} bytes at most per call"
+        if agreement is not None and differences:
+            worst = max(differences, key=lambda name: differences[name])
+            rows["checked"] = (
+                f"{agreement.states} states with {' and '.join(agreement.compilers)}, "
+                f"largest relative difference {differences[worst]:.1e} ({worst})"
+            )
+        print_rows(rows, "" if check else f"cmake -S {out} -B {out}/build && cmake --build {out}/build")
     for remark in remarks:
         note(remark)
 
@@ -139,33 +143,6 @@ def _write_tracker(file: Path, out: Path, name: str | None, force: bool, json: b
         print_json(data)
     else:
         print_rows({"tracker": f"{data['lines']} lines of C99, {source}", "header": str(header)})
-
-
-def _build_report(generated: GeneratedC, agreement: AgreementCheck | None) -> dict[str, Any]:
-    source = generated.folder / f"{generated.name}.c"
-    return {
-        "name": generated.name,
-        "source": str(source),
-        "lines": len(source.read_text().splitlines()),
-        "stack_bytes": generated.stack_bytes,
-        "checked_states": None if agreement is None else agreement.states,
-        "compilers": None if agreement is None else list(agreement.compilers),
-        "relative_differences": None if agreement is None else agreement.differences,
-    }
-
-
-def _format_rows(report: dict[str, Any]) -> dict[str, str]:
-    rows = {
-        "library": f"{report['name']}: {report['lines']} lines of C99, {report['source']}",
-        "stack": f"{report['stack_bytes']} bytes at most per call",
-    }
-    if differences := report["relative_differences"]:
-        worst = max(differences, key=differences.get)
-        rows["checked"] = (
-            f"{report['checked_states']} states with {' and '.join(report['compilers'])}, "
-            f"largest relative difference {differences[worst]:.1e} ({worst})"
-        )
-    return rows
 
 
 def require_settings(name: str, settings: Mapping[str, str]) -> None:

@@ -6,22 +6,12 @@ from typing import Annotated
 import typer
 
 from orthocas import problems
+from orthocas.bases.family import parse_parametrisation
 from orthocas.bases.products import Polynomial
-from orthocas.bases.registry import parse_parametrisation
 from orthocas.charts.figures import quality_figure, self_motion_figure
 from orthocas.charts.quality import evaluate
 from orthocas.charts.ready import load
-from orthocas.cli.options import (
-    AsJson,
-    Force,
-    LikeNames,
-    ProblemOptions,
-    SampleCount,
-    is_robot_file,
-    parse_likeness,
-    parse_weights,
-    parse_whole_number,
-)
+from orthocas.cli.options import AsJson, Force, ProblemOptions, SampleCount, Whole, is_robot_file, parse_weights
 from orthocas.cli.output import format_reach_rows, note, print_json, print_table, terminal_monitor
 from orthocas.errors import Interrupted, InvalidValueError, printable
 from orthocas.fitting.compare import Comparison
@@ -49,14 +39,8 @@ def compare(
     solver: Annotated[
         list[str] | None, typer.Option("--solver", help="Solver; repeat for more. Default: one that suits each.")
     ] = None,
-    seeds: Annotated[int, typer.Option("--seeds", parser=parse_whole_number, help="Number of seeds per fit.")] = 1,
+    seeds: Annotated[int, Whole("--seeds", help="Number of seeds per fit.")] = 1,
     samples: SampleCount = None,
-    held_out: Annotated[
-        int,
-        typer.Option(
-            "--held-out", parser=parse_whole_number, help="Number of held-out samples that every fit is evaluated on."
-        ),
-    ] = 100_000,
     domain: Annotated[
         str | None,
         typer.Option(
@@ -69,12 +53,8 @@ def compare(
         list[str] | None,
         typer.Option("--weights", help='"lambda1,lambda2", up to lambda5, as in fit; repeat for a front.'),
     ] = None,
-    like: LikeNames = None,
     jobs: Annotated[
-        int | None,
-        typer.Option(
-            "--jobs", parser=parse_whole_number, help="Number of processes, one thread each; default: all cores."
-        ),
+        int | None, Whole("--jobs", help="Number of processes, one thread each; default: all cores.")
     ] = None,
     out: Annotated[Path, typer.Option("--out", help="Folder for tables, pictures and charts.")] = Path("comparison"),
     force: Force = False,
@@ -107,9 +87,7 @@ def compare(
                     branch=branch,
                     seeds=seeds,
                     weights=losses,
-                    like=parse_likeness(like),
                     samples=samples,
-                    held_out=held_out,
                     jobs=jobs,
                     charts=charts,
                     control_ticks=True,

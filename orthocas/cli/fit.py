@@ -3,14 +3,13 @@
 import time
 import warnings
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from orthocas.bases.family import Parametrisation
-from orthocas.bases.registry import parse_parametrisation
+from orthocas.bases.family import Parametrisation, parse_parametrisation
 from orthocas.charts.chart_file import CHART
 from orthocas.charts.quality import Report, evaluate
 from orthocas.cli.options import (
@@ -18,20 +17,16 @@ from orthocas.cli.options import (
     DOMAIN,
     WEIGHTS_TEXT,
     AsJson,
-    DisabledPairs,
     Force,
-    LikeNames,
+    Number,
     ProblemName,
     ProblemOptions,
     SampleCount,
-    add_problem_options,
+    Whole,
     add_solids,
     is_robot_file,
-    parse_likeness,
-    parse_number,
     parse_weights,
-    parse_whole_number,
-    parse_wide_weights,
+    spread,
 )
 from orthocas.cli.output import (
     build_reach_data,
@@ -46,7 +41,7 @@ from orthocas.control.gains import find_holding_doubts
 from orthocas.errors import BranchWarning, Interrupted, InvalidValueError, OptionError
 from orthocas.fitting.fit import Fit
 from orthocas.fitting.fit import fit as fit_chart
-from orthocas.fitting.settings import choose_parametrisation
+from orthocas.fitting.stages import choose_parametrisation
 from orthocas.fitting.suggest_domain import CONDITIONING, LEAK_DEG, DomainSuggestion, suggest_domain
 from orthocas.fitting.terms import Weights
 from orthocas.fitting.wide import CLEARANCE, WideFit, fit_wide
@@ -67,102 +62,108 @@ from orthocas.tools.progress import Monitor
 _AUTO, _BRANCH, _ALL = "auto", "branch", "all"  # words of --domain
 _IN_CORRIDOR = "polynomial:3:cyclic"  # more terms gain little there
 _WIDE_ROWS = ("regular", "left out", "least leak", "meaning")  # facts of wide fits
+_PARAM = (
+    "Parametrisation: polynomial:5, polynomial:5:cyclic, polynomial:4:joints=2, fourier:2, mlp:64x64, mlp:64x64:raw, "
+    "linear or sew; default: polynomial:5, or polynomial:4 for more than seven joints; polynomial:3:cyclic with "
+    "--corridor; what is regular on the branch with --domain branch."
+)
+_SOLVER = "gauss_newton, quasi_newton, lbfgs, ipopt, adam or gradient_flow; default: what suits the parametrisation."
+_DOMAIN = (
+    "auto: the widest box around the home on which the fit keeps --leak-deg and --conditioning; branch: all of the "
+    "home's branch of the joint range (a wide chart); branch:NAME: of another one, see orthocas info --branches; all: "
+    "a chart of every branch, in an arm file for orthocas solve and oc.Arm."
+)
+_LIKE = "What the first coordinates are like: a joint or swivel; several: NAME,NAME."
+_EXACT = "With --domain branch: they are what --like says itself, on the part of the branch where that can be."
+_CORRIDOR = (
+    "Domain: the surroundings of a path of postures, one a line, with the joint names in the first line; their radius "
+    f"is --half-width [rad], default {RADIUS:g}."
+)
+_LEAK = "Largest leak for --domain auto [deg]; default 8."
+_CONDITIONING = "Smallest conditioning for --domain auto; default 0.2."
+_WEIGHTS = (
+    '"lambda1,lambda2", up to lambda5; "NAME=WEIGHT" for terms of your own. With --domain branch the first two weigh '
+    "leaks and mutual angles, and its own weights are the default."
+)
+_ANGLES = (
+    "Angles in the loss: paper (Euclidean norms) or metric; default: metric with --metric inertia and for tasks that "
+    "turn the tool."
+)
+_SOLIDS = "With --domain branch: be regular where the robot does not hit itself, by the solids of this file."
 
 
-@add_problem_options(*CHAIN, *DOMAIN)
+@dataclass(frozen=True)
+class FitOptions:
+    """The options of a fit, beside those that describe its problem."""
+
+    param: Annotated[str | None, typer.Option("--param", help=_PARAM)] = None
+    solver: Annotated[str | None, typer.Option("--solver", help=_SOLVER)] = None
+    domain: Annotated[str | None, typer.Option("--domain", help=_DOMAIN)] = None
+    like: Annotated[str | None, typer.Option("--like", help=_LIKE)] = None
+    exact: Annotated[bool, typer.Option("--exact", help=_EXACT)] = False
+    corridor: Annotated[Path | None, typer.Option("--corridor", metavar="POSTURES.csv", help=_CORRIDOR)] = None
+    leak_deg: Annotated[float | None, Number("--leak-deg", help=_LEAK)] = None
+    conditioning: Annotated[float | None, Number("--conditioning", help=_CONDITIONING)] = None
+    samples: SampleCount = None
+    seed: Annotated[int, Whole("--seed", help="Seed of the samples and of random starts.")] = 0
+    weights: Annotated[str, typer.Option("--weights", help=_WEIGHTS)] = WEIGHTS_TEXT
+    angles: Annotated[str | None, typer.Option("--angles", help=_ANGLES)] = None
+    collisions: Annotated[
+        str | None, typer.Option("--collisions", metavar="FILE.urdf|NAME[,FILE.srdf]", help=_SOLIDS)
+    ] = None
+
+    @property
+    def parametrisation(self) -> Parametrisation | None:
+        """That of --param, or of a corridor."""
+        param = _IN_CORRIDOR if self.param is None and self.corridor is not None else self.param
+        return None if param is None else parse_parametrisation(param)
+
+    @property
+    def quantities(self) -> str | list[str] | None:
+        """The name, or several, of --like."""
+        names = [word.strip() for word in (self.like or "").split(",")]
+        return None if self.like is None else names[0] if len(names) == 1 else names
+
+    @property
+    def wide_weights(self) -> Weights | Mapping[str, float] | None:
+        """Weights of a wide fit: numbers take the place of its own weights, terms by name alone join these."""
+        numbers = self.weights != WEIGHTS_TEXT and any("=" not in word for word in self.weights.split(","))
+        if self.angles is not None and not numbers:
+            raise OptionError(
+                "--angles requires the numbers of --weights with --domain branch, such as --weights 12,0.3"
+            )
+        if self.weights == WEIGHTS_TEXT:
+            return None
+        weights = parse_weights(self.weights, self.angles)
+        return weights if numbers else weights.extra
+
+    def parse_domain(self) -> tuple[str, str]:
+        """The kind of a domain, and the name of its branch; raises OptionError for options of another kind."""
+        kind, _, branch = (self.domain or "").partition(":")
+        if self.domain is not None and self.corridor is not None:
+            raise OptionError("--corridor is a domain: leave out --domain")
+        if kind != _AUTO:
+            for option, value in (("leak-deg", self.leak_deg), ("conditioning", self.conditioning)):
+                if value is not None:
+                    raise OptionError(f"--{option} requires --domain auto")
+        if self.domain not in (None, _AUTO) and kind != _BRANCH:
+            want = "auto, branch, branch:NAME, all, or --centre and --half-width for a box of your own"
+            raise InvalidValueError("--domain", repr(self.domain), want)
+        if kind != _BRANCH and self.collisions is not None:
+            raise OptionError("--collisions requires --domain branch")
+        if self.exact and (kind != _BRANCH or self.like is None):
+            raise OptionError("--exact requires --domain branch and --like")
+        if kind == _BRANCH and self.solver is not None:
+            raise OptionError("--domain branch has a solver of its own: leave out --solver")
+        return kind, branch.strip()
+
+
+@spread("words", ProblemOptions, *CHAIN, *DOMAIN)
+@spread("options", FitOptions)
 def fit(
     problem: ProblemName,
     words: ProblemOptions,
-    param: Annotated[
-        str | None,
-        typer.Option(
-            "--param",
-            help="Parametrisation: polynomial:5, polynomial:5:cyclic, polynomial:4:joints=2, fourier:2, mlp:64x64, "
-            "mlp:64x64:raw, linear or sew; default: polynomial:5, or polynomial:4 for more than seven joints; "
-            "polynomial:3:cyclic with --corridor; what is regular on the branch with --domain branch.",
-        ),
-    ] = None,
-    solver: Annotated[
-        str | None,
-        typer.Option(
-            "--solver",
-            help="gauss_newton, quasi_newton, lbfgs, ipopt, adam or gradient_flow; "
-            "default: one that suits the parametrisation.",
-        ),
-    ] = None,
-    domain: Annotated[
-        str | None,
-        typer.Option(
-            "--domain",
-            help="auto: the widest box around the home on which the fit keeps --leak-deg and --conditioning; "
-            "branch: all of the home's branch of the joint range (a wide chart); branch:NAME: of another one, "
-            "see orthocas info --branches; all: a chart of every branch, in an arm file for orthocas solve and oc.Arm.",
-        ),
-    ] = None,
-    like: LikeNames = None,
-    exact: Annotated[
-        bool,
-        typer.Option(
-            "--exact",
-            help="With --domain branch: they are what --like says itself, on the part of the branch where that can be.",
-        ),
-    ] = False,
-    corridor: Annotated[
-        Path | None,
-        typer.Option(
-            "--corridor",
-            metavar="POSTURES.csv",
-            help="Domain: the surroundings of a path of postures, one a line, with the joint names in the first line; "
-            f"their radius is --half-width [rad], default {RADIUS:g}.",
-        ),
-    ] = None,
-    leak_deg: Annotated[
-        float | None,
-        typer.Option("--leak-deg", parser=parse_number, help="Largest leak for --domain auto [deg]; default 8."),
-    ] = None,
-    conditioning: Annotated[
-        float | None,
-        typer.Option(
-            "--conditioning", parser=parse_number, help="Smallest conditioning for --domain auto; default 0.2."
-        ),
-    ] = None,
-    samples: SampleCount = None,
-    seed: Annotated[
-        int, typer.Option("--seed", parser=parse_whole_number, help="Seed of the samples and of random starts.")
-    ] = 0,
-    weights: Annotated[
-        str,
-        typer.Option(
-            "--weights",
-            help='"lambda1,lambda2", up to lambda5; "NAME=WEIGHT" for terms of your own. With --domain branch the '
-            "first two weigh leaks and mutual angles, and its own weights are the default.",
-        ),
-    ] = WEIGHTS_TEXT,
-    angles: Annotated[
-        str | None,
-        typer.Option(
-            "--angles",
-            help="Angles in the loss: paper (Euclidean norms) or metric; default: metric with --metric inertia and "
-            "for tasks that turn the tool.",
-        ),
-    ] = None,
-    max_mutual_deg: Annotated[
-        float | None,
-        typer.Option(
-            "--max-mutual-deg",
-            parser=parse_number,
-            help="Bound on the rms deviation of the mutual angles from 90 deg; Ipopt minimises the task angle.",
-        ),
-    ] = None,
-    collisions: Annotated[
-        str | None,
-        typer.Option(
-            "--collisions",
-            metavar="FILE.urdf|NAME",
-            help="With --domain branch: be regular where the robot does not hit itself, by the solids of this file.",
-        ),
-    ] = None,
-    srdf: DisabledPairs = None,
+    options: FitOptions,
     out: Annotated[
         Path | None, typer.Option("--out", help="Chart file; default: PROBLEM.orthocas in the current folder.")
     ] = None,
@@ -170,90 +171,55 @@ def fit(
     json: AsJson = False,
 ) -> None:
     """Fit extra coordinates to a problem and save the chart."""
-    bounds = {"leak_deg": leak_deg, "conditioning": conditioning}
-    if domain == _ALL:
-        own = {"param": param, "solver": solver, "like": like, "exact": exact or None, "corridor": corridor, **bounds}
-        own |= {"samples": samples, "angles": angles, "max-mutual-deg": max_mutual_deg}
-        own |= {"collisions": collisions, "srdf": srdf}
-        own |= {"weights": None if weights == WEIGHTS_TEXT else weights}
-        _fit_arm(problem, words, own, seed, out, force, json)
+    if options.domain == _ALL:
+        _fit_arm(problem, words, options, out, force, json)
         return
-    solids = (collisions, srdf)
-    kind, branch = _check_domain(domain, corridor, bounds, solids)
-    if exact and (kind != _BRANCH or like is None):
-        raise OptionError("--exact requires --domain branch and --like")
-    if kind == _BRANCH:
-        own = {"solver": solver, "max-mutual-deg": max_mutual_deg}
-        if given := [name for name, value in own.items() if value is not None]:
-            raise OptionError(f"--domain branch has a solver of its own: leave out --{given[0]}")
-
     # What can be refused is refused before anything takes time.
-    built = None if kind else _build_problem(problem, words, corridor)
+    kind, branch = options.parse_domain()
+    built = None if kind else _build_problem(problem, words, options.corridor)
     target = out or Path(f"{Path(problem).stem if built is None else built.name}.orthocas")
     require_free(target, CHART, force)
-    param = _IN_CORRIDOR if param is None and corridor is not None else param
-    parametrisation = None if param is None else parse_parametrisation(param)
-    minimiser = None if solver is None else get_solver(solver)
-    loss, wide_loss = parse_weights(weights, angles), parse_wide_weights(weights, angles) if kind == _BRANCH else None
-    quantities = parse_likeness(like)
+    parametrisation, like = options.parametrisation, options.quantities
+    solver = None if options.solver is None else get_solver(options.solver)
+    loss = parse_weights(options.weights, options.angles)
+    wide_loss = options.wide_weights if kind == _BRANCH else None
 
     suggestion, result = None, None
     try:
         with terminal_monitor() as monitor:
             if kind == _AUTO:
-                built, suggestion = _suggest_problem(problem, words, parametrisation, bounds, loss, seed, monitor)
+                built, suggestion = _suggest_problem(problem, words, options, parametrisation, loss, monitor)
                 # The fit that confirmed the domain serves if it has the family that is asked for.
                 default = choose_parametrisation(built, True) == choose_parametrisation(built, False)
                 same = parametrisation is not None or default
-                if same and (minimiser, samples, max_mutual_deg, like) == (None,) * 4:
+                if same and (solver, options.samples, like) == (None,) * 3:
                     result = replace(suggestion.fit, chart=replace(suggestion.fit.chart, problem=built))
             elif kind == _BRANCH:
-                result = _fit_wide(
-                    problem,
-                    words,
-                    branch,
-                    solids,
-                    quantities,
-                    exact or None,
-                    parametrisation,
-                    wide_loss,
-                    samples,
-                    seed,
-                    monitor,
-                )
+                result = _fit_wide(problem, words, options, branch, parametrisation, wide_loss, monitor)
             if result is None:
                 assert built is not None
                 result = fit_chart(
                     built,
                     parametrisation,
-                    minimiser,
+                    solver,
                     weights=loss,
-                    samples=samples,
-                    seed=seed,
+                    samples=options.samples,
+                    seed=options.seed,
                     monitor=monitor,
-                    max_mutual_deg=max_mutual_deg,
-                    like=quantities,
+                    like=like,
                 )
     except Interrupted as stop:
         result = stop.result
+    _save_and_report(result, suggestion, target, options.seed, force, json)
 
-    _save_and_report(result, suggestion, target, seed, force, json)
 
-
-def _fit_arm(
-    name: str,
-    words: ProblemOptions,
-    others: Mapping[str, Any],
-    seed: int,
-    out: Path | None,
-    force: bool,
-    json: bool,
-) -> None:
-    """Fit a chart to every branch, and write and print the arm; `others` are options that must not be given."""
+def _fit_arm(name: str, words: ProblemOptions, options: FitOptions, out: Path | None, force: bool, json: bool) -> None:
+    """Fit a chart to every branch, and write and print the arm."""
     from orthocas.arms.arm import Arm  # with all that arms need, which other fits do not
     from orthocas.arms.arm_file import ARM
 
-    if given := [option for option, value in others.items() if value is not None]:
+    plain = FitOptions(domain=options.domain, seed=options.seed)
+    if given := [part.name for part in fields(plain) if getattr(plain, part.name) != getattr(options, part.name)]:
         raise OptionError(f"--domain all chooses by itself: leave out --{given[0].replace('_', '-')}")
     words.require_none(("centre", "half_width", "home", "least_singular_value"), "--domain all is all there is")
     # What can be refused is refused before anything takes time.
@@ -263,44 +229,16 @@ def _fit_arm(
     robot, task, metric = _build_parts(name, replace(words, task=words.task or "pose"), base)
     begin = time.perf_counter()
     with terminal_monitor() as monitor:
-        arm = Arm.fit(robot, task, metric, seed=seed, monitor=monitor)
+        arm = Arm.fit(robot, task, metric, seed=options.seed, monitor=monitor)
     seconds = time.perf_counter() - begin
     arm.save(target, force)
-    shares = [chart.notes.get("share of the branch") for chart in arm.charts]
     if json:
-        branches = [
-            {"branch": branch, "share": clean(share)} for branch, share in zip(arm.branch_names, shares, strict=True)
-        ]
+        shares = [clean(chart.notes.get("share of the branch")) for chart in arm.charts]
+        branches = [{"branch": branch, "share": share} for branch, share in zip(arm.branch_names, shares, strict=True)]
         print_json({"arm": str(target), "task": task.name, "branches": branches, "seconds": seconds})
-        return
-    print_rows(
-        {**arm.facts(), "fit": f"{seconds:.1f} s", "file": str(target)}, f"orthocas solve {target} --x ... --xi 0"
-    )
-
-
-def _check_domain(
-    domain: str | None,
-    corridor: Path | None,
-    bounds: Mapping[str, float | None],
-    solids: tuple[str | None, Path | None],
-) -> tuple[str, str]:
-    """The kind of a domain, and the name of its branch; raises OptionError for options of another kind."""
-    kind, _, branch = (domain or "").partition(":")
-    if domain is not None and corridor is not None:
-        raise OptionError("--corridor is a domain: leave out --domain")
-    if kind != _AUTO:
-        for option, value in bounds.items():
-            if value is not None:
-                raise OptionError(f"--{option.replace('_', '-')} requires --domain auto")
-    if domain not in (None, _AUTO) and kind != _BRANCH:
-        raise InvalidValueError(
-            "--domain",
-            repr(domain),
-            "auto, branch, branch:NAME, all, or --centre and --half-width for a box of your own",
-        )
-    if kind != _BRANCH and solids != (None, None):
-        raise OptionError("--collisions requires --domain branch")
-    return kind, branch.strip()
+    else:
+        rows = {**arm.facts(), "fit": f"{seconds:.1f} s", "file": str(target)}
+        print_rows(rows, f"orthocas solve {target} --x ... --xi 0")
 
 
 def _build_problem(name: str, words: ProblemOptions, corridor: Path | None) -> Problem:
@@ -318,10 +256,9 @@ def _build_problem(name: str, words: ProblemOptions, corridor: Path | None) -> P
 def _suggest_problem(
     name: str,
     words: ProblemOptions,
+    options: FitOptions,
     parametrisation: Parametrisation | None,
-    bounds: Mapping[str, float | None],
     weights: Weights,
-    seed: int,
     monitor: Monitor,
 ) -> tuple[Problem, DomainSuggestion]:
     """The problem of `--domain auto`, and the suggestion that its domain comes from."""
@@ -336,11 +273,11 @@ def _suggest_problem(
         task,
         home,
         metric,
-        leak_deg=LEAK_DEG if bounds["leak_deg"] is None else bounds["leak_deg"],
-        conditioning=CONDITIONING if bounds["conditioning"] is None else bounds["conditioning"],
+        leak_deg=LEAK_DEG if options.leak_deg is None else options.leak_deg,
+        conditioning=CONDITIONING if options.conditioning is None else options.conditioning,
         parametrisation=parametrisation,
         weights=weights,
-        seed=seed,
+        seed=options.seed,
         monitor=monitor,
     )
     return Problem(robot, task, metric, suggestion.domain, Path(name).stem if base is None else base.name), suggestion
@@ -349,24 +286,19 @@ def _suggest_problem(
 def _fit_wide(
     name: str,
     words: ProblemOptions,
+    options: FitOptions,
     branch: str,
-    solids: tuple[str | None, Path | None],
-    like: str | list[str] | None,
-    exact: bool | None,
     parametrisation: Parametrisation | None,
     weights: Weights | Mapping[str, float] | None,
-    samples: int | None,
-    seed: int,
     monitor: Monitor,
 ) -> WideFit:
     """Fit the wide chart of `--domain branch`; the home chooses the branch if it has no name."""
     words.require_none(("centre", "half_width"), "--domain branch is a domain")
     base = None if is_robot_file(name) else replace(words, least_singular_value=None).build_problem(name)
     robot, task, metric = _build_parts(name, words, base)
-    free = solids != (None, None)
-    if free:
+    if options.collisions is not None:
         # The task is one of the same joints.
-        robot = add_solids(robot, *solids)
+        robot = add_solids(robot, options.collisions)
         task = Task.from_recipe(robot, task.recipe)
     centre = None if base is None or branch else base.domain.home
     with warnings.catch_warnings():
@@ -379,19 +311,19 @@ def _fit_wide(
             metric,
             clearance=CLEARANCE if words.least_singular_value is None else words.least_singular_value,
             parametrisation=parametrisation,
-            collisions=free,
+            collisions=options.collisions is not None,
             home=words.home if base is None else centre,
-            like=like,
-            exact=exact,
+            like=options.quantities,
+            exact=options.exact or None,
             weights=weights,
-            samples=samples,
-            seed=seed,
+            samples=options.samples,
+            seed=options.seed,
             monitor=monitor,
         )
 
 
 def _build_parts(name: str, words: ProblemOptions, base: Problem | None) -> tuple[Robot, Task, Metric | str]:
-    """Robot, task, metric and domain of a named problem, or those that the options describe for a robot file."""
+    """Robot, task and metric of a named problem, or those that the options describe for a robot file."""
     if base is not None:
         return base.robot, base.task, base.metric
     robot = words.build_robot(name)
@@ -428,6 +360,8 @@ def _format_fit(result: Fit, report: Report, target: Path) -> dict[str, str]:
     coordinates, robot = result.chart.coordinates, result.chart.problem.robot
     rows = format_report_rows(report, result.chart)
     rows["robot"] = f"{robot.n} joints, {'tip' if len(robot.tips) == 1 else 'tips'} {listed(robot.tips)}"
+    if not isinstance(result, WideFit):
+        rows |= result.chart.problem.domain.describe_condition()
     # Adam follows a schedule, so its end is no failure
     planned = result.status is Status.ITERATION_LIMIT and result.chart.notes.get("solver") == "adam"
     ended = "all steps made" if planned else result.status.value
@@ -460,20 +394,16 @@ def _format_fit(result: Fit, report: Report, target: Path) -> dict[str, str]:
     return {**rows, **format_reach_rows(result.chart), "chart": str(target)}
 
 
-def _describe_wide(result: Fit) -> dict[str, Any]:
-    if not isinstance(result, WideFit):
-        return {}
-    named = result.chart.parts.named_coordinates[0].partition(": ")[2]
-    meaning = None if result.meaning is None else {"like": named, **asdict(result.meaning)}
-    return {
-        "branch": result.branch.name,
-        **collect_attributes(result, "regular_share", "left_out", "least_leak"),
-        "meaning": meaning,
-    }
-
-
 def _describe_fit(result: Fit, report: Report, target: Path, suggestion: DomainSuggestion | None) -> dict[str, Any]:
     check = result.problem_check
+    wide: dict[str, Any] = {}
+    if isinstance(result, WideFit):
+        named = result.chart.parts.named_coordinates[0].partition(": ")[2]
+        wide = {
+            "branch": result.branch.name,
+            **collect_attributes(result, "regular_share", "left_out", "least_leak"),
+            "meaning": None if result.meaning is None else {"like": named, **asdict(result.meaning)},
+        }
     return {
         **({} if suggestion is None else {"suggested_domain": suggestion.as_dict()}),
         "chart": str(target),
@@ -483,7 +413,7 @@ def _describe_fit(result: Fit, report: Report, target: Path, suggestion: DomainS
         "status": result.status.value,
         "seconds": result.seconds,
         "idle_joints": list(result.idle_joints),
-        **_describe_wide(result),
+        **wide,
         "least_conditioning": None if result.worst is None else result.worst.least,
         "cyclic_joints": list(result.cyclic_joints),
         "near_singular_share": check.singular_share,

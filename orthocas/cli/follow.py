@@ -9,25 +9,14 @@ import typer
 
 from orthocas.charts.chart import Chart
 from orthocas.charts.ready import load
-from orthocas.cli.options import (
-    AsJson,
-    ChartPath,
-    DisabledPairs,
-    Force,
-    Solids,
-    parse_number,
-    parse_numbers,
-    parse_one_or_all,
-    read_solids,
-)
+from orthocas.cli.options import AsJson, ChartPath, Force, Number, Solids, parse_numbers, parse_one_or_all, read_solids
 from orthocas.cli.output import print_json, print_rows
 from orthocas.errors import InvalidValueError, OptionError
 from orthocas.paths.follow import HOLD, OBJECTIVE
 from orthocas.paths.follow import follow as follow_path
 from orthocas.paths.joint_motion import JointMotion, require_place
 from orthocas.paths.tool_path import read_path
-from orthocas.robots.obstacles import Capsule, Plane, Sphere
-from orthocas.robots.scene import Scene, Solid
+from orthocas.robots.obstacles import Capsule, Plane, Scene, Solid, Sphere
 from orthocas.tools.checks import Array, require_known
 from orthocas.tools.interrupts import deferred
 
@@ -40,22 +29,11 @@ def follow(
     path: Annotated[Path, typer.Argument(metavar="PATH.csv", help="Waypoints of the tool, see docs/how-to/paths.md.")],
     out: Annotated[Path, typer.Option("--out", help="CSV file for times, positions, velocities and accelerations.")],
     xi: Annotated[
-        str | None,
-        typer.Option("--xi", help="Extra coordinates: hold, schedule (columns of PATH.csv) or objective."),
+        str | None, typer.Option("--xi", help="Extra coordinates: hold, schedule (columns of PATH.csv) or objective.")
     ] = None,
-    start: Annotated[
-        str | None, typer.Option("--start", help='Joint positions near the start, "0,0.5,..."; default: the centre.')
-    ] = None,
-    period: Annotated[
-        float, typer.Option("--period", parser=parse_number, help="Distance of the time stamps [s].")
-    ] = 0.01,
+    period: Annotated[float, Number("--period", help="Distance of the time stamps [s].")] = 0.01,
     velocity: Annotated[
-        str | None,
-        typer.Option("--velocity-limit", help="Of all joints or each [rad/s], [m/s]; default: the robot's."),
-    ] = None,
-    acceleration: Annotated[
-        str | None,
-        typer.Option("--acceleration-limit", help="Of all joints or each [rad/s^2]; default: full speed in 0.5 s."),
+        str | None, typer.Option("--velocity-limit", help="Of all joints or each [rad/s], [m/s]; default: the robot's.")
     ] = None,
     obstacle: Annotated[
         list[str] | None,
@@ -65,19 +43,12 @@ def follow(
         ),
     ] = None,
     link_radius: Annotated[
-        float | None,
-        typer.Option(
-            "--link-radius", parser=parse_number, help="Take rods of this radius for links, without --collisions [m]."
-        ),
+        float | None, Number("--link-radius", help="Take rods of this radius for links, without --collisions [m].")
     ] = None,
     clearance: Annotated[
-        float,
-        typer.Option(
-            "--clearance", parser=parse_number, help="Smallest distance of links, and of links and obstacles [m]."
-        ),
+        float, Number("--clearance", help="Smallest distance of links, and of links and obstacles [m].")
     ] = 0.0,
     collisions: Solids = None,
-    srdf: DisabledPairs = None,
     force: Force = False,
     json: AsJson = False,
 ) -> None:
@@ -90,7 +61,7 @@ def follow(
         loaded.function("xi")
     # What is to be followed, and what the arm may hit: its links, or rods in their place, and obstacles.
     waypoints, choice = _read_task(path, loaded, xi)
-    solids = read_solids(loaded.problem.robot, collisions, srdf)
+    solids = read_solids(loaded.problem.robot, collisions)
     if link_radius is not None and (solids is not None or not obstacle):
         raise OptionError("--link-radius requires --obstacle, and no --collisions, which has the true links")
     if obstacle:
@@ -107,10 +78,8 @@ def follow(
         loaded,
         waypoints,
         choice,
-        q_start=None if start is None else parse_numbers("--start", start),
         period=period,
         velocity_limits=None if velocity is None else parse_one_or_all("--velocity-limit", velocity),
-        acceleration_limits=None if acceleration is None else parse_one_or_all("--acceleration-limit", acceleration),
         clearance=clearance,
         collisions=solids,
     )

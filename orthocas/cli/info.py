@@ -9,16 +9,7 @@ import typer
 
 from orthocas import problems
 from orthocas.bases.cyclic import cyclic_joints
-from orthocas.cli.options import (
-    AsJson,
-    DisabledPairs,
-    ProblemName,
-    ProblemOptions,
-    Solids,
-    add_problem_options,
-    is_robot_file,
-    read_solids,
-)
+from orthocas.cli.options import AsJson, ProblemName, ProblemOptions, Solids, is_robot_file, read_solids, spread
 from orthocas.cli.output import build_reach_data, print_json, print_rows, print_table
 from orthocas.errors import OptionError, RobotError, SingularTaskError
 from orthocas.exact.involutivity import involutivity
@@ -40,7 +31,7 @@ _FAULTS = ("near_singular_share", "half_turn_share", "touching_share")
 _SHARES = ("share", "clear_share", "share of the branch", "branches", *_FAULTS)  #: names of numbers to show in percent
 
 
-@add_problem_options("tip", "lock", "tool", "base")
+@spread("words", ProblemOptions, "tip", "lock", "base")
 def info(
     target: ProblemName,
     words: ProblemOptions,
@@ -48,7 +39,6 @@ def info(
         bool, typer.Option("--branches", help="Of a robot: also the branches of its joint range, for wide charts.")
     ] = False,
     collisions: Solids = None,
-    srdf: DisabledPairs = None,
     json: AsJson = False,
 ) -> None:
     """Show a chart, a named problem, or a robot."""
@@ -59,14 +49,14 @@ def info(
             **_describe_robot(robot),
             **_describe_redundancy(robot),
             **(_describe_branches(robot, None) if branches else {}),
-            **_describe_collisions(read_solids(robot, collisions, srdf), robot.sample),
+            **_describe_collisions(read_solids(robot, collisions), robot.sample),
         }
     elif target in problems.names():
         problem = words.build_problem(target)
         data = {
             **_describe_problem(problem),
             **(_describe_branches(problem.robot, problem.task) if branches else {}),
-            **_describe_collisions(read_solids(problem.robot, collisions, srdf), problem.domain.sample),
+            **_describe_collisions(read_solids(problem.robot, collisions), problem.domain.sample),
         }
     elif branches:
         raise OptionError(f"--branches requires a robot file or a named problem, not the chart {target}")
@@ -78,7 +68,7 @@ def info(
             "parametrisation": chart.coordinates.label,
             "parameters": chart.coordinates.size,
             **build_reach_data(chart),
-            **_describe_collisions(read_solids(chart.problem.robot, collisions, srdf), chart.problem.domain.sample),
+            **_describe_collisions(read_solids(chart.problem.robot, collisions), chart.problem.domain.sample),
             "notes": dict(chart.notes),
             **({"certificate": chart.certificate.as_dict()} if chart.certificate else {}),
         }
@@ -91,7 +81,14 @@ def info(
         rows = {name: _format(value, name) for name, value in data.items() if name not in tables}
         print_rows(rows, "" if branches else then)
         if branches:
-            print_table(_tabulate_branches(data), f"{then} --task pose --domain branch")
+            # Name, share, the clearance that a wide chart needs if it is lower, and a posture.
+            lower = data.get("clearance_at_most", {})
+            table = [("branch", "share", *(("clearance at most",) if lower else ()), "a posture")]
+            for name, share in data["branches"].items():
+                posture = ", ".join(f"{value:.2f}" for value in data["postures"][name])
+                clearance = (_format(lower.get(name, "default")),) if lower else ()
+                table.append((name, percent(share), *clearance, posture))
+            print_table(table, f"{then} --task pose --domain branch")
 
 
 def _load_chart(target: str) -> "Chart":
@@ -170,24 +167,19 @@ def _describe_collisions(collisions: Collisions | None, draw: Callable[[int, int
     }
 
 
-def _tabulate_branches(data: dict[str, Any]) -> list[tuple[str, ...]]:
-    """The branches as a table: name, share, the clearance that a wide chart needs if it is lower, and a posture."""
-    lower = data.get("clearance_at_most", {})
-    head = ("branch", "share", *(("clearance at most",) if lower else ()), "a posture")
-    rows = [
-        (
-            name,
-            percent(share),
-            *((_format(lower.get(name, "default")),) if lower else ()),
-            ", ".join(f"{value:.2f}" for value in data["postures"][name]),
-        )
-        for name, share in data["branches"].items()
-    ]
-    return [head, *rows]
-
-
 def _describe_problem(problem: Problem) -> dict[str, Any]:
     checked = check(problem)
+    try:
+        result = involutivity(problem)
+    except (SingularTaskError, RobotError) as error:
+        exact: dict[str, Any] = {"verdict": f"unknown whether exact coordinates exist: {error}"}
+    else:
+        exact = {
+            "involutivity_defect": {"mean": result.mean, "max": result.max},
+            "expected_leak_deg": result.expected_leak_deg,
+            "expected_angle_deg": result.expected_angle_deg,
+            "verdict": result.verdict,
+        }
     return {
         "problem": problem.name,
         "n": problem.n,
@@ -204,21 +196,8 @@ def _describe_problem(problem: Problem) -> dict[str, Any]:
         "near_singular_share": checked.singular_share,
         "half_turn_share": checked.half_turn_share,
         "most_singular_point": list(checked.most_singular_point),
-        **_describe_involutivity(problem),
+        **exact,
         **_describe_robot(problem.robot),
-    }
-
-
-def _describe_involutivity(problem: Problem) -> dict[str, Any]:
-    try:
-        result = involutivity(problem)
-    except (SingularTaskError, RobotError) as error:
-        return {"verdict": f"unknown whether exact coordinates exist: {error}"}
-    return {
-        "involutivity_defect": {"mean": result.mean, "max": result.max},
-        "expected_leak_deg": result.expected_leak_deg,
-        "expected_angle_deg": result.expected_angle_deg,
-        "verdict": result.verdict,
     }
 
 

@@ -2,10 +2,10 @@
 
 import inspect
 from collections.abc import Callable, Mapping
-from dataclasses import astuple, dataclass, replace
-from functools import wraps
+from dataclasses import astuple, dataclass, fields, replace
+from functools import partial, wraps
 from pathlib import Path
-from typing import Annotated, Any, cast
+from typing import Annotated, Any, cast, get_type_hints
 
 import numpy as np
 import typer
@@ -40,112 +40,47 @@ def parse_number(text: str) -> float:
         raise typer.BadParameter(f"received {text!r}, expected a number") from None
 
 
+Number = partial(typer.Option, parser=parse_number)
+Whole = partial(typer.Option, parser=parse_whole_number)
+
 # Options of several commands. An option of one command stands in its signature.
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace files of the same names that orthocas did not write.")]
 ChartPath = Annotated[Path, typer.Argument(metavar="CHART", help="A chart file.")]
 ProblemName = Annotated[str, typer.Argument(metavar="PROBLEM|FILE.urdf", help="A named problem or a URDF file.")]
-LikeNames = Annotated[
-    str | None,
-    typer.Option("--like", help="What the first coordinates are like: a joint or swivel; several: NAME,NAME."),
-]
 SampleCount = Annotated[
-    int | None,
-    typer.Option(
-        "--samples", parser=parse_whole_number, help="Number of training samples; default: from the problem size."
-    ),
+    int | None, Whole("--samples", help="Number of training samples; default: from the problem size.")
 ]
-Limit = Annotated[
-    str | None,
-    typer.Option(
-        "--limit", help='Largest torque or speed, "50" or "50,40,..." per joint; default: the limits of the robot.'
-    ),
-]
+_LIMIT = 'Largest torque or speed, "50" or "50,40,..." per joint; default: the limits of the robot.'
+Limit = Annotated[str | None, typer.Option("--limit", help=_LIMIT)]
+_SOLIDS = (
+    "Check collisions with the solids of this URDF file of the robot, or of a known robot such as panda. After a "
+    "comma, an SRDF file whose disabled pairs are not checked; default: that of the URDF file."
+)
+Solids = Annotated[str | None, typer.Option("--collisions", metavar="FILE.urdf|NAME[,FILE.srdf]", help=_SOLIDS)]
 
-Solids = Annotated[
-    str | None,
-    typer.Option(
-        "--collisions",
-        metavar="FILE.urdf|NAME",
-        help="Check collisions with the solids of this URDF file of the robot, or of a known robot such as panda.",
-    ),
-]
-DisabledPairs = Annotated[
-    Path | None,
-    typer.Option("--srdf", help="SRDF file whose disabled pairs are not checked; default: that of the URDF file."),
-]
-
-# Options that describe a robot and a problem: the fields of `ProblemOptions`. Commands say which of them they take.
+# Options that describe a robot and a problem. Commands say which of them they take.
 
 ROBOT = ("tip", "lock", "tool", "base", "gravity", "payload")
 CHAIN = (*ROBOT, "task", "metric")
 DOMAIN = ("centre", "home", "half_width", "least_singular_value")
-_PROBLEM_OPTIONS: dict[str, Any] = {
-    "tip": Annotated[
-        str | None,
-        typer.Option("--tip", help="Tip frame of a robot file, or LEFT,RIGHT; default: the end of its chain."),
-    ],
-    "lock": Annotated[
-        list[str] | None,
-        typer.Option(
-            "--lock", metavar="JOINT=VALUE", help="Lock a joint of a robot file at a value [rad or m]; repeat for more."
-        ),
-    ],
-    "tool": Annotated[
-        str | None,
-        typer.Option("--tool", help='Pose of a tool on the tip, "x,y,z" or "x,y,z,roll,pitch,yaw" [m, rad].'),
-    ],
-    "base": Annotated[
-        str | None, typer.Option("--base", help="Moving base of a robot file: planar, rail:x, floating, ...")
-    ],
-    "gravity": Annotated[
-        str | None,
-        typer.Option(
-            "--gravity",
-            help='Gravity in the axes of the base of a robot file, "x,y,z" [m/s^2]; default: that of an MJCF file, '
-            "or 0,0,-9.81.",
-        ),
-    ],
-    "payload": Annotated[
-        str | None,
-        typer.Option(
-            "--payload",
-            help='What the tip of a robot file carries: "kg", or "kg,x,y,z" with its centre in the tip frame [m].',
-        ),
-    ],
-    "task": Annotated[
-        str | None,
-        typer.Option("--task", help=f"Task: {', '.join(list_task_kinds())}; AXES such as xy, AXIS x, y or z."),
-    ],
-    "metric": Annotated[str | None, typer.Option("--metric", help="Metric: euclidean or inertia.")],
-    "centre": Annotated[str | None, typer.Option("--centre", help='Centre of the domain, "0,0.5,..." [rad or m].')],
-    "home": Annotated[
-        str | None,
-        typer.Option(
-            "--home", help="Named posture as centre of the domain, from an MJCF file or the SRDF beside a URDF."
-        ),
-    ],
-    "half_width": Annotated[
-        str | None,
-        typer.Option(
-            "--half-width", help='Half-width of the domain, "0.4" or one per joint [rad or m]; radius of a corridor.'
-        ),
-    ],
-    "least_singular_value": Annotated[
-        float | None,
-        typer.Option(
-            "--least-singular-value",
-            parser=parse_number,
-            help="Leave positions out of the domain where the task's relative singular value is smaller, such as 0.1.",
-        ),
-    ],
-}
+_TIP = "Tip frame of a robot file, or LEFT,RIGHT; default: the end of its chain."
+_LOCK = "Lock a joint of a robot file at a value [rad or m]; repeat for more."
+_TOOL = 'Pose of a tool on the tip, "x,y,z" or "x,y,z,roll,pitch,yaw" [m, rad].'
+_GRAVITY = (
+    'Gravity in the axes of the base of a robot file, "x,y,z" [m/s^2]; default: that of an MJCF file, or 0,0,-9.81.'
+)
+_PAYLOAD = 'What the tip of a robot file carries: "kg", or "kg,x,y,z" with its centre in the tip frame [m].'
+_TASK = f"Task: {', '.join(list_task_kinds())}; AXES such as xy, AXIS x, y or z."
+_HOME = "Named posture as centre of the domain, from an MJCF file or the SRDF beside a URDF."
+_HALF_WIDTH = 'Half-width of the domain, "0.4" or one per joint [rad or m]; radius of a corridor.'
+_LEAST = "Leave positions out of the domain where the task's relative singular value is smaller, such as 0.1."
 
 # Options of earlier versions, and what says the same now. Commands refuse them with these words.
 
 FORMER = {
-    "--branch": "the branch is named by --domain branch:NAME",
+    "--branch": "fit names the branch by --domain branch:NAME; Python asks for one: arm.solve(x, xi, branch=NAME)",
     "--radius": "the radius of a corridor is --half-width",
     "--precision": "the precision is set in Python: oc.fit(precision='single')",
     "--scheduler": "the address of a scheduler is a value of --workers",
@@ -155,6 +90,19 @@ FORMER = {
     "--gravity": "the gravity of a robot is an option of fit; whether a law compensates gravity: "
     "codegen --gravity-compensation law or robot",
     "--cycles": "a comparison has three cycles; orthocas.viewer.cyclic_motions takes their number",
+    "--srdf": "name the file after that of the solids: --collisions FILE.urdf,FILE.srdf",
+    "--tool": "a tool changes nothing there; fit takes it",
+    "--seed": "the seed of noise is a third number of --noise; of an evaluation, oc.evaluate(chart, seed=2) sets it",
+    "--held-out": "the number of held-out samples is set in Python: oc.compare(held_out=1000)",
+    "--max-mutual-deg": "the bound is set in Python: oc.fit(max_mutual_deg=2)",
+    "--compiled": "set in Python: oc.simulate(compiled=True)",
+    "--acceleration-limit": "limits of acceleration are set in Python: oc.follow(acceleration_limits=2)",
+    "--open": "open the address that the command prints",
+    "--host": "the address to listen at is a value of --port, HOST:PORT",
+    "--fastest": "set in Python: oc.control.PDPlus.on_chart(chart, fastest=20)",
+    "--compliance": "set in Python: oc.control.PDPlus.on_chart(chart, compliance=1e-4)",
+    "--damping-stiffness": "set in Python: oc.control.PDPlus.on_chart(chart, damping_stiffness=50)",
+    "--start": "the start of a motion is set in Python: oc.follow(chart, path, q_start=q)",
 }
 
 
@@ -162,23 +110,25 @@ FORMER = {
 class ProblemOptions:
     """The command-line options that describe a problem."""
 
-    tip: str | None = None
-    lock: tuple[str, ...] = ()
-    tool: str | None = None
-    base: str | None = None
-    gravity: str | None = None
-    payload: str | None = None
-    task: str | None = None
-    metric: str | None = None
-    centre: str | None = None
-    home: str | None = None
-    half_width: str | None = None
-    least_singular_value: float | None = None
+    tip: Annotated[str | None, typer.Option("--tip", help=_TIP)] = None
+    lock: Annotated[list[str] | None, typer.Option("--lock", metavar="JOINT=VALUE", help=_LOCK)] = None
+    tool: Annotated[str | None, typer.Option("--tool", help=_TOOL)] = None
+    base: Annotated[
+        str | None, typer.Option("--base", help="Moving base of a robot file: planar, rail:x, floating, ...")
+    ] = None
+    gravity: Annotated[str | None, typer.Option("--gravity", help=_GRAVITY)] = None
+    payload: Annotated[str | None, typer.Option("--payload", help=_PAYLOAD)] = None
+    task: Annotated[str | None, typer.Option("--task", help=_TASK)] = None
+    metric: Annotated[str | None, typer.Option("--metric", help="Metric: euclidean or inertia.")] = None
+    centre: Annotated[str | None, typer.Option("--centre", help='Centre of the domain, "0,0.5,..." [rad or m].')] = None
+    home: Annotated[str | None, typer.Option("--home", help=_HOME)] = None
+    half_width: Annotated[str | None, typer.Option("--half-width", help=_HALF_WIDTH)] = None
+    least_singular_value: Annotated[float | None, Number("--least-singular-value", help=_LEAST)] = None
 
     def require_none(self, names: tuple[str, ...], reason: str) -> None:
         """Raise OptionError with the reason if one of these options was given."""
         for name in names:
-            if getattr(self, name) not in (None, ()):
+            if getattr(self, name) not in (None, []):
                 raise OptionError(f"{reason}: leave out --{name.replace('_', '-')}")
 
     def require_no_robot(self, owner: str) -> None:
@@ -213,15 +163,16 @@ class ProblemOptions:
         if is_robot_file(name):
             robot = self.build_robot(name)
             task = Task.named(robot, self.task or "position")
-            centre = self.find_centre(robot)
-            centre = regular_box(robot, task).centre if centre is None else centre
-            box = default_box(robot, centre, self.parse_half_width())
+            centre, half_width, box = self.find_centre(robot), self.parse_half_width(), None
+            if centre is not None or half_width is not None:
+                centre = regular_box(robot, task).centre if centre is None else centre
+                box = default_box(robot, centre, half_width)
             return Problem(robot, task, self.metric or "euclidean", box, Path(name).stem, self.least_singular_value)
         if name not in problems.names():
             raise UnknownNameError("problem or robot", name, (*problems.names(), *list_robot_files(), "or a FILE.urdf"))
         # A named problem, with what the options change.
         base: Problem = problems.get(name)
-        if all(value in (None, ()) for value in astuple(self)):
+        if all(value in (None, []) for value in astuple(self)):
             return base
         self.require_no_robot(f"the named problem '{name}'")
         centre, half_width, domain = self.find_centre(base.robot), self.parse_half_width(), base.domain
@@ -234,7 +185,7 @@ class ProblemOptions:
     def parse_locks(self) -> dict[str, float]:
         """The joints and values of --lock."""
         locked = {}
-        for word in self.lock:
+        for word in self.lock or ():
             joint, equals, value = word.rpartition("=")
             if not (joint and equals):
                 raise InvalidValueError("--lock", word, "JOINT=VALUE")
@@ -254,22 +205,20 @@ class ProblemOptions:
         return None if self.half_width is None else parse_one_or_all("--half-width", self.half_width)
 
 
-def read_solids(robot: Robot, urdf: str | None, srdf: Path | None) -> Collisions | None:
-    """The collision model that --collisions and --srdf name; None without them. Errors as in `add_solids`."""
-    return None if urdf is None and srdf is None else add_solids(robot, urdf, srdf).collisions
+def read_solids(robot: Robot, solids: str | None) -> Collisions | None:
+    """The collision model that --collisions names; None without it. Errors as in `add_solids`."""
+    return None if solids is None else add_solids(robot, solids).collisions
 
 
-def add_solids(robot: Robot, urdf: str | None, srdf: Path | None) -> Robot:
-    """The robot with the solids that --collisions and --srdf name.
+def add_solids(robot: Robot, solids: str) -> Robot:
+    """The robot with the solids, and pairs to leave out, that --collisions names.
 
     Raises:
-        OptionError: for --srdf alone.
         RobotError: if a file cannot be read, or is that of another robot.
     """
-    if urdf is None:
-        raise OptionError("--srdf requires --collisions FILE.urdf, which has the solids")
+    urdf, _, srdf = solids.partition(",")
     path = find_robot_file(urdf) if is_robot_name(urdf) else Path(urdf)
-    solid = robot.with_solids(path, srdf)
+    solid = robot.with_solids(path, srdf or None)
     if missing := solid.collisions.missing:
         note(f"nothing is known of {listed(missing)}: no mesh in {path}, so contacts with it go unseen")
     return solid
@@ -288,22 +237,23 @@ def is_robot_name(name: str) -> bool:
     return plain and name in list_robot_files() and not Path(name).exists()
 
 
-def add_problem_options(*names: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """A decorator of commands: options of these names take the place of the parameter `words`, a `ProblemOptions`."""
-    options = {name: _PROBLEM_OPTIONS[name] for name in names}
-    return spread_options(
-        "words", options, lambda values: ProblemOptions(**{**values, "lock": tuple(values.get("lock") or ())})
-    )
+def spread(parameter: str, kind: type, *names: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
+    """A decorator of commands: fields of a dataclass of options, by default all, take the place of one parameter."""
+    hints = get_type_hints(kind, include_extras=True)
+    options = {
+        field.name: (hints[field.name], field.default) for field in fields(kind) if not names or field.name in names
+    }
+    return spread_options(parameter, options, lambda values: kind(**values))
 
 
 def spread_options(
-    parameter: str, options: Mapping[str, Any], build: Callable[[dict[str, Any]], Any]
+    parameter: str, options: Mapping[str, tuple[Any, Any]], build: Callable[[dict[str, Any]], Any]
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
     """A decorator of commands: options take the place of one parameter.
 
     Args:
         parameter: its name.
-        options: annotations of the options, by name; they are optional.
+        options: annotations and defaults of the options, by name.
         build: makes the parameter of the values of the options.
     """
 
@@ -313,8 +263,8 @@ def spread_options(
             if part.name != parameter:
                 parameters.append(part.replace(kind=part.KEYWORD_ONLY))
                 continue
-            for name, annotation in options.items():
-                parameters.append(inspect.Parameter(name, part.KEYWORD_ONLY, default=None, annotation=annotation))
+            for name, (annotation, default) in options.items():
+                parameters.append(inspect.Parameter(name, part.KEYWORD_ONLY, default=default, annotation=annotation))
 
         @wraps(command)
         def call(**values: Any) -> None:
@@ -351,17 +301,6 @@ _WEIGHTS = ("task", "mutual", "regularity", "length", "folds")
 WEIGHTS_TEXT = ",".join(f"{getattr(DEFAULT_WEIGHTS, name):g}" for name in _WEIGHTS)
 
 
-def parse_wide_weights(text: str, angles: str | None) -> Weights | Mapping[str, float] | None:
-    """Read the weights of a wide fit: numbers take the place of its own weights, terms by name alone join these."""
-    numbers = text != WEIGHTS_TEXT and any("=" not in word for word in text.split(","))
-    if angles is not None and not numbers:
-        raise OptionError("--angles requires the numbers of --weights with --domain branch, such as --weights 12,0.3")
-    if text == WEIGHTS_TEXT:
-        return None
-    weights = parse_weights(text, angles)
-    return weights if numbers else weights.extra
-
-
 def parse_weights(text: str, angles: str | None) -> Weights:
     """Read two to five numbers and terms by name, such as "1000,30,quiet=5", with the kind of angles."""
     words = [word.strip() for word in text.split(",")]
@@ -372,9 +311,3 @@ def parse_weights(text: str, angles: str | None) -> Weights:
     for name, _, value in (word.partition("=") for word in words if "=" in word):
         extra[name.strip()] = float(parse_numbers(f"--weights {name}", value)[0])
     return replace(Weights.of(numbers) if numbers else Weights(), extra=extra, angles=cast(Angles | None, angles))
-
-
-def parse_likeness(text: str | None) -> str | list[str] | None:
-    """The name, or several, of --like."""
-    names = [word.strip() for word in (text or "").split(",")]
-    return None if text is None else names[0] if len(names) == 1 else names

@@ -1,6 +1,7 @@
 """`orthocas simulate`: a controller in the coordinates of a chart, run in closed loop."""
 
 import time
+from collections.abc import Iterator
 from functools import partial
 from math import isfinite
 from pathlib import Path
@@ -13,25 +14,13 @@ from orthocas.charts.chart import Chart
 from orthocas.charts.quality import evaluate
 from orthocas.charts.ready import load
 from orthocas.cli.codegen import CONTROLLERS, add_law_options, build_controller, require_settings
-from orthocas.cli.options import (
-    AsJson,
-    ChartPath,
-    DisabledPairs,
-    Force,
-    Limit,
-    Solids,
-    parse_number,
-    parse_numbers,
-    parse_whole_number,
-    read_solids,
-)
+from orthocas.cli.options import AsJson, ChartPath, Force, Limit, Number, Solids, parse_numbers, read_solids
 from orthocas.cli.output import note, print_json, print_rows, terminal_monitor
 from orthocas.control.controller import Controller, ControlStatus, law_of
 from orthocas.control.reference import Reference
 from orthocas.control.safety import Safety
 from orthocas.errors import ArchiveError, Interrupted, InvalidValueError, OptionError, SingularTaskError
 from orthocas.robots.collisions import Collisions
-from orthocas.robots.robot import Robot
 from orthocas.simulation.disturbances import Friction, Noise, Plan, read_steps
 from orthocas.simulation.figure import FORMATS, require_format, save_animation, trajectory_figure, units_of
 from orthocas.simulation.mujoco_plant import MUJOCO, MuJoCo
@@ -43,10 +32,12 @@ from orthocas.tools.display import percent
 from orthocas.tools.files import is_listed, open_output_folder, publish, require_replaceable_files, require_writable
 from orthocas.tools.interrupts import INTERRUPTED, deferred
 from orthocas.tools.json import clean, write_json
-from orthocas.tools.progress import Monitor
 
 _FILES = ("trajectory.npz", "coordinates.png", "report.json")
 CVODES = "cvodes"  #: the default plant
+_NOISE = (
+    'Standard deviation of the sensors, "position,velocity" [rad], [rad/s], or "position,velocity,seed"; needs --rate.'
+)
 _FAILED = (Outcome.DIVERGED, Outcome.LOST)  # the input was valid, but the run failed: exit code 1
 
 
@@ -60,10 +51,7 @@ def simulate(
     out: Annotated[Path, typer.Option("--out", help="Folder for the run, its pictures and the report.")],
     settings: dict[str, str],
     limit: Limit = None,
-    rate: Annotated[
-        float | None,
-        typer.Option("--rate", parser=parse_number, help="Control rate [Hz]; default: continuous control."),
-    ] = None,
+    rate: Annotated[float | None, Number("--rate", help="Control rate [Hz]; default: continuous control.")] = None,
     plant: Annotated[
         str, typer.Option("--plant", help="Simulator: cvodes, or mujoco (needs --rate and the extra [mujoco]).")
     ] = CVODES,
@@ -71,47 +59,24 @@ def simulate(
         bool,
         typer.Option("--supervised", help="Run the supervised law of the generated C (needs --rate and a C compiler)."),
     ] = False,
-    compiled: Annotated[
-        bool, typer.Option("--compiled", help="Compile law and robot first: for long runs; needs a C compiler.")
-    ] = False,
     mass_factor: Annotated[
-        float | None,
-        typer.Option(
-            "--mass-factor", parser=parse_number, help="True masses divided by those of the controller's model."
-        ),
+        float | None, Number("--mass-factor", help="True masses divided by those of the controller's model.")
     ] = None,
     friction: Annotated[
         str | None, typer.Option("--friction", help='Joint friction, "viscous,coulomb" [N m s/rad], [N m].')
     ] = None,
-    noise: Annotated[
-        str | None,
-        typer.Option(
-            "--noise", help='Standard deviation of the sensors, "position,velocity" [rad], [rad/s]; needs --rate.'
-        ),
-    ] = None,
-    seed: Annotated[
-        int | None, typer.Option("--seed", parser=parse_whole_number, help="Seed of the noise; default: 0.")
-    ] = None,
+    noise: Annotated[str | None, typer.Option("--noise", help=_NOISE)] = None,
     animation: Annotated[
         str, typer.Option("--animation", help="Format of the animation: gif, mp4 (needs ffmpeg) or none.")
     ] = "gif",
     collisions: Solids = None,
-    srdf: DisabledPairs = None,
     force: Force = False,
     json: AsJson = False,
 ) -> None:
     """Run a controller in a chart's coordinates; write the run, pictures, an animation and a report."""
     # What can be refused is refused before the chart is read.
     require_settings(controller, settings)
-    for option, value in {"--mass-factor": mass_factor, "--friction": friction}.items():
-        if value is not None and law_of(controller).command != "torque":
-            takers = ", ".join(name for name in CONTROLLERS if law_of(name).command == "torque")
-            raise OptionError(f"{controller} has no {option}, which belongs to {takers}")
-    require_known("plant", plant, (CVODES, MUJOCO))
-    if plant == MUJOCO and rate is None:
-        raise OptionError("--plant mujoco requires --rate: MuJoCo runs with a sampled controller")
-    if supervised and rate is None:
-        raise OptionError("--supervised requires --rate: a supervised law runs tick by tick")
+    _check_plant(controller, plant, rate, supervised, {"--mass-factor": mass_factor, "--friction": friction})
     _check_folder(out, animation, force)
     # CasADi may lose Ctrl-C while it builds functions.
     with deferred():
@@ -120,19 +85,22 @@ def simulate(
         loaded.function("xi")
         plan = read_steps(steps, loaded)
         law = build_controller(controller, loaded, settings, limit)
-    solids = read_solids(loaded.problem.robot, collisions, srdf)
-    conditions = {
+    solids = read_solids(loaded.problem.robot, collisions)
+    robot = None if mass_factor is None else loaded.problem.robot.with_scaled_masses(mass_factor)
+    conditions: dict[str, Any] = {
         "control_rate": rate,
-        "plant": _build_plant(plant, loaded.problem.robot, mass_factor),
+        "plant": MuJoCo(robot) if plant == MUJOCO else robot,
         "friction": None if friction is None else Friction(*parse_numbers("--friction", friction, 2).tolist()),
-        "noise": _build_noise(law, noise, seed, rate),
+        "noise": _build_noise(law, noise, rate),
         "safety": Safety.of(law) if supervised else None,
-        "compiled": compiled,
     }
     # The run, its files and its pictures; Ctrl-C keeps what there is.
     begin = time.perf_counter()
     with terminal_monitor() as monitor:
-        run = _run(law, plan, conditions, monitor)
+        try:
+            run = run_closed_loop(law, plan.reference, plan.q_start, pushes=plan.pushes, monitor=monitor, **conditions)
+        except Interrupted as stop:
+            run = stop.result
         finish = partial(_finish, law, loaded, plan, run, time.perf_counter() - begin, out, force)
         interrupted = run.outcome is Outcome.INTERRUPTED
         try:
@@ -148,11 +116,25 @@ def simulate(
         print_json(report)
     else:
         print_rows(format_report(report, loaded.problem) | {"files": str(out)}, f"orthocas view {out} --chart {chart}")
-    _print_notes(law, report, interrupted)
+    for remark in (*law.remarks(), *_list_remarks(report, interrupted)):
+        note(remark)
     if solids is not None:
         note(_find_contact(solids, run))
     if code := INTERRUPTED if interrupted else int(run.outcome in _FAILED):
         raise typer.Exit(code)
+
+
+def _check_plant(controller: str, plant: str, rate: float | None, supervised: bool, of_torques: dict[str, Any]) -> None:
+    """Refuse options that do not fit the law, or require a rate of ticks."""
+    for option, value in of_torques.items():
+        if value is not None and law_of(controller).command != "torque":
+            takers = ", ".join(name for name in CONTROLLERS if law_of(name).command == "torque")
+            raise OptionError(f"{controller} has no {option}, which belongs to {takers}")
+    require_known("plant", plant, (CVODES, MUJOCO))
+    if plant == MUJOCO and rate is None:
+        raise OptionError("--plant mujoco requires --rate: MuJoCo runs with a sampled controller")
+    if supervised and rate is None:
+        raise OptionError("--supervised requires --rate: a supervised law runs tick by tick")
 
 
 def _check_folder(out: Path, animation: str, force: bool) -> None:
@@ -166,33 +148,16 @@ def _check_folder(out: Path, animation: str, force: bool) -> None:
     require_replaceable_files(out, names, force)
 
 
-def _build_plant(plant: str, model: Robot, mass_factor: float | None) -> Robot | MuJoCo | None:
-    """The true robot, or MuJoCo with it; None if it is the controller's model."""
-    robot = None if mass_factor is None else model.with_scaled_masses(mass_factor)
-    return MuJoCo(robot) if plant == MUJOCO else robot
-
-
-def _build_noise(law: Controller, text: str | None, seed: int | None, rate: float | None) -> Noise | None:
-    """The noise of the sensors; raises InvalidValueError for an option that would be ignored."""
+def _build_noise(law: Controller, text: str | None, rate: float | None) -> Noise | None:
+    """The noise of the sensors; raises InvalidValueError for a law that does not measure what is noisy."""
     if text is None:
-        if seed is not None:
-            raise OptionError("--seed requires --noise: nothing else is random")
         return None
     if rate is None:
         raise OptionError("--noise requires --rate: white noise needs control ticks")
-    position, velocity = parse_numbers("--noise", text, 2).tolist()
+    position, velocity, *seed = parse_numbers("--noise", text, 3 if text.count(",") == 2 else 2).tolist()
     if law.command == "velocity" and velocity != 0:
         raise InvalidValueError("--noise", text, f"a velocity deviation of 0, because {law.name} measures no velocity")
-    return Noise(position, velocity, 0 if seed is None else seed)
-
-
-def _run(law: Controller, plan: Plan, conditions: dict[str, Any], monitor: Monitor) -> Trajectory:
-    """Run the closed loop, or what there is of it at Ctrl-C."""
-    try:
-        return run_closed_loop(law, plan.reference, plan.q_start, pushes=plan.pushes, monitor=monitor, **conditions)
-    except Interrupted as stop:
-        run: Trajectory = stop.result
-        return run
+    return Noise(position, velocity, int(seed[0]) if seed and seed[0].is_integer() else seed[0] if seed else 0)
 
 
 def _finish(
@@ -211,19 +176,16 @@ def _finish(
     return report
 
 
-def _print_notes(law: Controller, report: dict[str, Any], interrupted: bool) -> None:
-    """Print remarks about the run on standard error."""
-    for remark in law.remarks():
-        note(remark)
-    fallback = format_fallback(report)
-    if fallback is not None:
-        note(fallback)
+def _list_remarks(report: dict[str, Any], interrupted: bool) -> Iterator[str]:
+    """What went wrong in a run."""
+    if (fallback := format_fallback(report)) is not None:
+        yield fallback
     if report["outcome"] == Outcome.LOST.value:
-        note(f"the law lost the arm: {report['reason']}")
+        yield f"the law lost the arm: {report['reason']}"
     if report["outcome"] == Outcome.DIVERGED.value:
-        note(f"the run diverged: the integrator gave up at t = {report['duration']:.4g} s, the run so far is saved")
+        yield f"the run diverged: the integrator gave up at t = {report['duration']:.4g} s, the run so far is saved"
     if interrupted:
-        note("interrupted: the run so far is saved, without an animation")
+        yield "interrupted: the run so far is saved, without an animation"
 
 
 def _find_contact(collisions: Collisions, run: Trajectory) -> str:
@@ -294,9 +256,18 @@ def build_report(controller: Controller, chart: Chart, plan: Plan, seen: Traject
         "share_inside_domain": float(inside.mean()),
         "command": seen.kind,
         "largest_command": dict(zip(seen.joint_names, largest, strict=True)),
-        "energy": _evaluate_energy(seen) if seen.kind == "torque" and not bad.size else None,
+        "energy": None,
         "seconds": seconds,
     }
+    if seen.kind == "torque" and not bad.size:
+        report["energy"] = {
+            "storage_start": seen.storage[0],
+            "storage_end": seen.storage[-1],
+            "storage_largest": seen.storage.max(),
+            "storage_rise": seen.storage_rise,
+            # by the controller's damping [J]
+            "dissipated": seen.energy_balance[-1] - seen.storage[-1] + seen.storage[0],
+        }
     return dict(clean(report))
 
 
@@ -368,15 +339,11 @@ def _evaluate_angles(chart: Chart, seen: Trajectory) -> dict[str, Any] | None:
 def _evaluate_coupling(chart: Chart, reference: Reference, seen: Trajectory) -> dict[str, dict[str, float]]:
     """Commanded -> disturbed -> index, for quantities that were commanded alone."""
     coupling = coupling_index(chart, reference, seen)
-    return {
-        commanded: {
-            disturbed: float(coupling.index[i, j])
-            for i, disturbed in enumerate(coupling.labels)
-            if isfinite(coupling.index[i, j])
-        }
-        for j, commanded in enumerate(coupling.labels)
-        if np.isfinite(coupling.index[:, j]).any()
+    columns = {
+        commanded: {to: float(value) for to, value in zip(coupling.labels, column, strict=True) if isfinite(value)}
+        for commanded, column in zip(coupling.labels, coupling.index.T, strict=True)
     }
+    return {commanded: column for commanded, column in columns.items() if column}
 
 
 def _find_worst_couplings(index: dict[str, dict[str, float]], task: tuple[str, ...]) -> str:
@@ -390,18 +357,6 @@ def _find_worst_couplings(index: dict[str, dict[str, float]], task: tuple[str, .
             value, to, by = max(chosen)
             texts.append(f"{name} {value:.3g} ({to} <- {by})")
     return ", ".join(texts) or "see report.json"
-
-
-def _evaluate_energy(seen: Trajectory) -> dict[str, float]:
-    """Storage, and the energy dissipated by the controller's damping, [J]."""
-    taken = seen.energy_balance[-1] - seen.storage[-1] + seen.storage[0]
-    return {
-        "storage_start": seen.storage[0],
-        "storage_end": seen.storage[-1],
-        "storage_largest": seen.storage.max(),
-        "storage_rise": seen.storage_rise,
-        "dissipated": taken,
-    }
 
 
 def _format(value: float | None) -> str:

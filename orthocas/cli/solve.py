@@ -30,15 +30,13 @@ def solve(
     x: Annotated[
         str,
         typer.Option(
-            "--x",
-            help='Task value "0.5,0,0.4,..."; of a pose also x,y,z,qw,qx,qy,qz, or a 4 x 4 matrix row by row.',
+            "--x", help='Task value "0.5,0,0.4,..."; of a pose also x,y,z,qw,qx,qy,qz, or a 4 x 4 matrix row by row.'
         ),
     ],
     xi: Annotated[str | None, typer.Option("--xi", help="Extra coordinates; default: near --start.")] = None,
     start: Annotated[
         str | None, typer.Option("--start", help='Joint positions to be near to, "0,0.5,..."; default: none.')
     ] = None,
-    branch: Annotated[str | None, typer.Option("--branch", help="Of an arm: accept no other branch.")] = None,
     every: Annotated[bool, typer.Option("--all", help="Of an arm: every posture with x and --xi.")] = False,
     json: AsJson = False,
 ) -> None:
@@ -51,9 +49,9 @@ def solve(
         if every:
             if value is None:
                 raise OptionError("--all requires --xi")
-            postures: Any = arm.solve(target, value, near, ANY if branch is None else branch, all=True)
+            postures: Any = arm.solve(target, value, near, ANY, all=True)
         else:
-            postures = arm.solve(target, value, near, ANY if branch is None else branch)
+            postures = arm.solve(target, value, near, ANY)
         single = postures.q.ndim == 1
         statuses = [postures.status] if single else postures.status
         branches = [postures.branch] if single else postures.branch
@@ -61,8 +59,8 @@ def solve(
             zip(np.atleast_2d(postures.q), np.atleast_1d(postures.xi)[:, None], statuses, branches, strict=True)
         )
     else:
-        if branch is not None or every:
-            raise OptionError("--branch and --all require an arm file, such as orthocas fit --domain all writes")
+        if every:
+            raise OptionError("--all requires an arm file, such as orthocas fit --domain all writes")
         chart = load(file)
         target = _read_target(chart.task, x)
         q_start = chart.domain.home if near is None else near

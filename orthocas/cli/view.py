@@ -1,6 +1,5 @@
 """`orthocas view`: a chart, a robot or a motion in the browser."""
 
-import webbrowser
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,14 +12,13 @@ from orthocas.charts.chart import Chart
 from orthocas.charts.ready import load
 from orthocas.cli.options import (
     AsJson,
-    DisabledPairs,
     Force,
     ProblemOptions,
     Solids,
-    add_problem_options,
     is_robot_file,
     parse_whole_number,
     read_solids,
+    spread,
 )
 from orthocas.cli.output import note, print_json, print_rows
 from orthocas.errors import OptionError
@@ -34,6 +32,7 @@ from orthocas.viewer.motion import cyclic_motions, read_joint_motion, read_run
 from orthocas.viewer.view import PORT, export_page, require_page
 from orthocas.viewer.window import LOCAL, is_local, require_free
 
+_PORT = "0: any free one. HOST: the address to listen at; 0.0.0.0 is open to the network."
 _RUN = "trajectory.npz"  # in the folders of `orthocas simulate`
 
 
@@ -47,7 +46,7 @@ class _Scene:
     locked: dict[str, float]
 
 
-@add_problem_options("tip", "lock")
+@spread("words", ProblemOptions, "tip", "lock")
 def view(
     target: Annotated[
         str,
@@ -73,16 +72,15 @@ def view(
         typer.Option("--export", metavar="PAGE.html", help="Write a page that moves by itself and works offline."),
     ] = None,
     collisions: Solids = None,
-    srdf: DisabledPairs = None,
-    host: Annotated[str, typer.Option("--host", help="Address to listen at; 0.0.0.0: open to the network.")] = LOCAL,
-    port: Annotated[int, typer.Option("--port", parser=parse_whole_number, help="0: any free one.")] = PORT,
-    browse: Annotated[bool, typer.Option("--open", help="Open the page in the browser.")] = False,
+    port: Annotated[str, typer.Option("--port", metavar="[HOST:]PORT", help=_PORT)] = str(PORT),
     force: Force = False,
     json: AsJson = False,
 ) -> None:
     """Show a chart, a robot or a motion in the browser, until Ctrl-C."""
+    place, _, text = port.rpartition(":")
+    host, number = place.strip("[]") or LOCAL, parse_whole_number(text)
     if export is None:
-        require_free(host, port)
+        require_free(host, number)
     else:
         require_page(export, force)
     # CasADi may lose Ctrl-C while it builds functions.
@@ -98,7 +96,7 @@ def view(
     else:
         played = _read_played(scene, path, export)
     arm, meshes, locks = scene.robot, scene.meshes, scene.locked
-    solids = _read_collisions(scene, collisions, srdf, export)
+    solids = _read_collisions(scene, collisions, export)
     # A page that works offline, or one that is served until Ctrl-C.
     if export is not None:
         shape = export_page(scene.shown, export, robot=arm, robot_file=meshes, locked=locks, force=force)
@@ -110,18 +108,16 @@ def view(
             print_rows({"page": str(export), "size": f"{size / 2**20:.1f} MiB, with all it needs: it works offline"})
         return
     opened = open_view(
-        scene.shown, robot=arm, robot_file=meshes, locked=locks, collisions=solids, path=played, host=host, port=port
+        scene.shown, robot=arm, robot_file=meshes, locked=locks, collisions=solids, path=played, host=host, port=number
     )
     with opened as page:
         _note_missing(page.missing)
         local = is_local(host)
-        who = "this machine only (--host opens it to others)" if local else "all who reach it and know this address"
+        only, others = "this machine only (--port 0.0.0.0:PORT opens it)", "all who reach it and know this address"
         if json:
             print_json({"url": page.url, "host": host, "local": local, "missing_meshes": list(page.missing)})
         else:
-            print_rows({"page": page.url, "open to": who, "end": "Ctrl-C"})
-        if browse and not webbrowser.open(page.url):
-            note(f"no browser could be opened here; open {page.url} yourself")
+            print_rows({"page": page.url, "open to": only if local else others, "end": "Ctrl-C"})
         page.wait()
 
 
@@ -160,11 +156,11 @@ def _read_played(scene: _Scene, path: Path | None, export: Path | None) -> Array
     return x if xi is None else np.hstack([x, xi])
 
 
-def _read_collisions(scene: _Scene, urdf: str | None, srdf: Path | None, export: Path | None) -> Collisions | None:
+def _read_collisions(scene: _Scene, solids: str | None, export: Path | None) -> Collisions | None:
     """The collision model that the page of a chart shows."""
     if isinstance(scene.shown, Chart) and export is None:
-        return read_solids(scene.shown.robot, urdf, srdf)
-    if urdf is not None or srdf is not None:
+        return read_solids(scene.shown.robot, solids)
+    if solids is not None:
         raise OptionError("--collisions is for live pages of charts: leave it out")
     return None
 

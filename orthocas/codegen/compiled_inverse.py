@@ -12,8 +12,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.charts.chart import Chart
+from orthocas.charts.curve_tracer import SearchKernel, has_library
 from orthocas.charts.inverse import Inverse, Solutions, build_phi, build_phi_of_wish, solve_rows
-from orthocas.charts.motion_kernel import SearchKernel, has_library
 from orthocas.charts.newton import NEWTON, Attempt, Newton
 from orthocas.codegen.generate import generate_c
 from orthocas.codegen.rendering import get_source

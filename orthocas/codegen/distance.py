@@ -9,7 +9,7 @@ from typing import Any
 import casadi as ca
 import numpy as np
 
-from orthocas.charts.clearance import RULES as CLEARANCE
+from orthocas.charts.walls import RULES as CLEARANCE
 from orthocas.codegen.export_forms import Form, write_function
 from orthocas.codegen.rendering import Precision, clean_word, clean_words, render
 from orthocas.robots.capsules import FittedCapsules

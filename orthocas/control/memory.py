@@ -503,12 +503,13 @@ def _build_momentum(tree: KinematicTree, with_payload: bool, with_gravity: bool)
     C^T dq is the gradient of the kinetic energy dq^T M dq / 2 by q: dM/dt dq = C dq + C^T dq.
     """
     q, dq, rest = ca.SX.sym("q", tree.n), ca.SX.sym("dq", tree.n), ca.SX(tree.n, 1)
-    payload = [ca.SX.sym("payload", dynamics.PAYLOAD)] if with_payload else []
-    p = dynamics.build_inverse_dynamics(tree, q, rest, dq, np.zeros(3), *payload)
+    payload = ca.SX.sym("payload", dynamics.PAYLOAD) if with_payload else None
+    p = dynamics.build_inverse_dynamics(tree, q, rest, dq, payload, gravity=np.zeros(3))
     rate = ca.gradient(ca.dot(dq, p) / 2, q)
     if with_gravity:
-        rate -= dynamics.build_bias(tree, q, rest, tree.gravity, *payload)
-    return ca.Function("momentum", [q, dq, *payload], [ca.densify(p), ca.densify(rate)])
+        rate -= dynamics.build_bias(tree, q, rest, payload)
+    inputs = [q, dq] if payload is None else [q, dq, payload]
+    return ca.Function("momentum", inputs, [ca.densify(p), ca.densify(rate)])
 
 
 def _build_regressor(tree: KinematicTree) -> tuple[ca.Function, tuple[int, ...]]:
@@ -516,10 +517,10 @@ def _build_regressor(tree: KinematicTree) -> tuple[ca.Function, tuple[int, ...]]
     q, dq, w, a = (ca.SX.sym(name, tree.n) for name in ("q", "dq", "w", "a"))
     numbers = ca.SX.sym("numbers", len(dynamics.collect_inertials(tree)))
     rest, weightless = ca.SX(tree.n, 1), np.zeros(3)
-    force = dynamics.build_inverse_dynamics(tree, q, rest, a, tree.gravity, inertials=numbers)
+    force = dynamics.build_inverse_dynamics(tree, q, rest, a, inertials=numbers)
     # C(q, dq) w by polarisation, as in `dynamics.build_coriolis_product`.
     for sign in (1, -1):
-        force += sign / 4 * dynamics.build_bias(tree, q, dq + sign * w, weightless, inertials=numbers)
+        force += sign / 4 * dynamics.build_bias(tree, q, dq + sign * w, inertials=numbers, gravity=weightless)
     places, joints = dynamics.find_first_moments(tree)
     # The force is linear in them, but for the rotors' inertias, which do not depend on the first moments.
     Y = ca.jacobian(force, numbers)[:, places]

@@ -141,13 +141,10 @@ class _OperationalSpace(LawOfChart):
         "stiffness": Setting(
             '"100", or "100,50,..." per quantity; default: modes up to 18 Hz (PD+), around 6 Hz (impedance).'
         ),
-        "fastest": Setting("Frequency that no mode exceeds [rad/s]; default: none with a given stiffness."),
-        "compliance": Setting("Of each joint, in series with the springs [rad/(N m)], with --fastest; default: none."),
         "delay": Setting("Delay from measurement to torque that the default stiffness is to bear [s]; default: 0."),
         "damping_ratio": Setting('"0.7", or "0.7,1,..." per quantity; default: 0.7.'),
         "coupling": Setting("coupled (default) or decoupled.", is_word=True),
         "damping": Setting("double_diagonal (default) or square_root.", is_word=True),
-        "damping_stiffness": Setting("Design the damping for this stiffness, so that --stiffness may be 0 in places."),
         "model": Setting(
             "own (default), or given: mass matrix and torques become inputs.", is_word=True, codegen_only=True
         ),

@@ -44,7 +44,6 @@ class SafetyRules:
     anchor: float = 5.0  #: rate of the way to the anchor, of velocity laws [1/s]
     return_speed: float = 0.3  #: on the way back [rad/s] or [m/s]
     rest_speed: float = 0.5  #: below which joints count as slow [rad/s] or [m/s]
-    rest: float = 0.3  #: and at most this share of the speed limit
     stops: float = 30.0  #: natural frequency at the joint limits [rad/s]
     zone: float = 0.05  #: of stops, at most this share of the range of a joint [rad] or [m]
     stuck_speed: float = 0.15  #: that commands must have given to an arm that measures the same [rad/s]
@@ -195,7 +194,7 @@ class Safety:
         settings = {
             "command_rate": np.fmax(RULES.torque_rate, sliding) if torque else np.full(n, RULES.acceleration),
             "speed_limit": speed_limit,
-            "rest_speed": np.minimum(RULES.rest_speed, RULES.rest * speed_limit),
+            "rest_speed": np.full(n, RULES.rest_speed),
             "near_margin": 0.06,
             "catch_margin": 0.01,
             "return_margin": 0.1,

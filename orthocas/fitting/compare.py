@@ -17,8 +17,7 @@ from pathlib import Path
 from statistics import median
 from typing import TYPE_CHECKING, Any, cast
 
-from orthocas.bases.family import Parametrisation
-from orthocas.bases.registry import parametrisation_to_data, parse_parametrisation
+from orthocas.bases.family import Parametrisation, parametrisation_to_data, parse_parametrisation
 from orthocas.charts.chart_file import CHART
 from orthocas.charts.quality import evaluate
 from orthocas.charts.ready import load
@@ -26,10 +25,10 @@ from orthocas.codegen.library import control_tick
 from orthocas.errors import ChartFileError, Interrupted, InvalidValueError, OrthocasError
 from orthocas.fitting.fit import Fit, fit
 from orthocas.fitting.like import Likeness
-from orthocas.fitting.settings import choose_solver
+from orthocas.fitting.stages import choose_solver
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, WeightNumbers, Weights
 from orthocas.fitting.wide import CLEARANCE, WideFit, fit_wide
-from orthocas.solvers.gauss_newton import GaussNewton
+from orthocas.solvers.minimisers import GaussNewton
 from orthocas.solvers.protocol import Solver, Status
 from orthocas.tasks.branches import Branch, branches
 from orthocas.tasks.domains import Box

@@ -3,13 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import casadi as ca
 import numpy as np
 
-from orthocas.bases.circle import CircleFamily
+from orthocas.bases.composed import CircleFamily
 from orthocas.bases.family import Family, JointSpace, LinearFamily, Parametrisation
 from orthocas.bases.products import Polynomial
 from orthocas.charts.chart import Chart
@@ -17,7 +17,7 @@ from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.quality import Report, evaluate
 from orthocas.errors import GrowError, InvalidValueError
 from orthocas.exact.flow import GrownCoordinates
-from orthocas.solvers.lbfgs import LBFGS
+from orthocas.solvers.minimisers import LBFGS
 from orthocas.solvers.protocol import Solver
 from orthocas.tasks.samples import sample_evenly, sample_uniform
 from orthocas.tools.batch import Batched, dense_function
@@ -113,7 +113,12 @@ def distil(
     # values and gradients of the grown chart at the samples that have them
     points = sample_evenly(chart.problem.domain, count, require_count("seed", seed, least=0))
     targets = _sample_targets(chart, points)
-    own_targets = targets if circle is None else _take_circle_pairs(targets)
+    own_targets = targets
+    if circle is not None:
+        # cosines, then sines of angles, and their gradients
+        c, s, g = np.cos(targets.xi), np.sin(targets.xi), targets.gradients
+        gradients = np.concatenate([-s[:, :, None] * g, c[:, :, None] * g], axis=1)
+        own_targets = replace(targets, xi=np.concatenate([c, s], axis=1), gradients=gradients)
     # bases by least squares, networks by a minimiser
     if isinstance(family, LinearFamily):
         theta, offset = _solve_least_squares(family, own_targets, watch)
@@ -162,13 +167,6 @@ class _Targets:
     xi: Array  #: (N, r)
     gradients: Array  #: (N, r, n), multiplied by `weight`
     weight: float  #: length scale that makes gradients comparable to values
-
-
-def _take_circle_pairs(targets: _Targets) -> _Targets:
-    """Cosines, then sines of angles, and their gradients."""
-    c, s, g = np.cos(targets.xi), np.sin(targets.xi), targets.gradients
-    gradients = np.concatenate([-s[:, :, None] * g, c[:, :, None] * g], axis=1)
-    return _Targets(targets.points, np.concatenate([c, s], axis=1), gradients, targets.weight)
 
 
 def _sample_targets(chart: Chart, points: Array) -> _Targets:

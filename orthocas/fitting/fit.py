@@ -11,18 +11,22 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from orthocas.bases.circle import CircleFamily
-from orthocas.bases.cyclic import Mobile, anywhere, widen_over_cyclic_joints
-from orthocas.bases.family import CyclicParametrisation, JointSpace, Parametrisation, ReorderableFamily
-from orthocas.bases.registry import warn_unless_savable
+from orthocas.bases.composed import CircleFamily, Mobile
+from orthocas.bases.cyclic import anywhere, widen_over_cyclic_joints
+from orthocas.bases.family import (
+    CyclicParametrisation,
+    JointSpace,
+    Parametrisation,
+    ReorderableFamily,
+    warn_unless_savable,
+)
 from orthocas.charts.chart import Chart
 from orthocas.charts.coordinates import Coordinates
 from orthocas.charts.point_quality import WorstPoints
 from orthocas.charts.quality import evaluate
 from orthocas.errors import DomainError, Interrupted, InvalidValueError, OrthocasError
 from orthocas.fitting.like import Likeness
-from orthocas.fitting.settings import RULES, FitSettings, Precision
-from orthocas.fitting.stages import Begin, Continuation, FoldSearch, Solution, Stage, StageRunner
+from orthocas.fitting.stages import RULES, Begin, Continuation, FitSettings, FoldSearch, Precision, Solution, Stage
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, WeightNumbers, Weights
 from orthocas.robots.robot import Robot
 from orthocas.solvers.protocol import Solver, Status
@@ -171,7 +175,7 @@ def _fit(
     # the domain that the family asks for, and whether the task can be regular there
     parametrisation = settings.parametrisation
     warn_unless_savable(parametrisation)
-    if isinstance(parametrisation, CyclicParametrisation):
+    if isinstance(parametrisation, CyclicParametrisation) and parametrisation.cyclic:
         problem = widen_over_cyclic_joints(problem, tuple(parametrisation.cyclic))
     if problem.robot.tree.floating and (parametrisation.closed_form is not None or not settings.split_idle):
         expected = "one to fit in the arms' joints, such as Polynomial(1), with split_idle: the base floats"
@@ -183,8 +187,12 @@ def _fit(
         samples = sample_problem(problem, RULES.first, (settings.seed, RULES.first_tag))
         # closed forms need no minimisation; others run the stages of `orthocas.fitting.stages`
         if parametrisation.closed_form is not None:
-            solution = Solution((), parametrisation, None)
-            coordinates = _evaluate_closed_form(problem, parametrisation, samples)
+            values, solution = parametrisation.closed_form(problem), Solution((), parametrisation, None)
+            r, space = problem.r, JointSpace.of(problem)
+            raw = Coordinates(parametrisation, space, (), values.theta, np.zeros(r), np.ones(r))
+            origin = problem.domain.home if values.origin is None else values.origin
+            coordinates = normalise(raw, origin, samples)
+            coordinates = coordinates if values.scaled else replace(coordinates, scale=np.ones(r))
         else:
             singular = problem_check.singular_samples > 0
             solution, coordinates = _solve(problem, settings, monitor, samples, align_to, begin, singular)
@@ -203,17 +211,6 @@ def _fit(
         if result.status is Status.INTERRUPTED or pressed():
             raise Interrupted(result)
     return result
-
-
-def _evaluate_closed_form(problem: Problem, parametrisation: Parametrisation, samples: Samples) -> Coordinates:
-    """Coordinates in closed form, which need no minimisation; see `orthocas.bases.ClosedForm`."""
-    assert parametrisation.closed_form is not None
-    values = parametrisation.closed_form(problem)
-    r = problem.r
-    raw = Coordinates(parametrisation, JointSpace.of(problem), (), values.theta, np.zeros(r), np.ones(r))
-    origin = problem.domain.home if values.origin is None else values.origin
-    scaled = normalise(raw, origin, samples)
-    return scaled if values.scaled else replace(scaled, scale=np.ones(r))
 
 
 def _solve(
@@ -237,8 +234,7 @@ def _solve(
     like = None if settings.like is None else settings.like.build_term(problem, active)
     settings = settings if like is None else settings.add_term(like)
     folds = FoldSearch(problem, active, settings.fold_weight(problem), singular)
-    runner = StageRunner(problem, settings, active, monitor, folds, like)
-    solution = Continuation(runner, r, begin).run()
+    solution = Continuation(problem, settings, active, monitor, folds, like, begin).run()
     # angles leave free where xi is zero, how long its gradient is, the order and the signs
     raw = Coordinates(solution.parametrisation, space, idle, solution.theta, np.zeros(r), np.ones(r))
     coordinates = normalise(raw, problem.domain.home, samples)

@@ -1,8 +1,10 @@
 """The loss of a network: with gradients by NumPy, or as one CasADi graph of dense products."""
 
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
 from collections.abc import Iterator, Mapping
 from copy import copy
-from dataclasses import dataclass, field
 from math import ceil
 from typing import NamedTuple, Self
 
@@ -23,6 +25,73 @@ from orthocas.tools.columns import Run, arrange_blocks, build_weights, split_by_
 from orthocas.tools.expressions import replay
 
 
+class _SampledLoss(ABC):
+    """Mean loss (25) of a family on fixed samples; how gradients are computed is left to subclasses.
+
+    Args:
+        family: the coordinates.
+        samples: fixed samples of the family's joints.
+        weights: weights of the loss.
+        start: parameters, (size,), whose orientation the regularity term keeps.
+        draw: draws fresh samples.
+        orientation: sign of the volume of the coordinates that the regularity term keeps. Default: that of the start.
+    """
+
+    def __init__(
+        self, family: Family, samples: Samples, weights: Weights, start: Array, draw: Draw, orientation: float | None
+    ) -> None:
+        m, n = samples.task_jacobian.shape[1:]
+        self._draw, self._orientation = draw, orientation
+        self._loss = Loss.of(Sizes(n, m, family.outputs, samples.metric_inverse is None), weights.by_name)
+        # the start orients coordinates, at some of the samples
+        if orientation is None and (self._loss.oriented or weights.folds > 0):
+            some = samples[: RULES.orienting]
+            self._orientation = some.orientation(self._evaluate_jacobian(some.points, start))
+        self._put(samples, len(samples))
+
+    @abstractmethod
+    def _evaluate_jacobian(self, points: Array, theta: Array) -> Array:
+        """J_xi at points (N, n), (N, r, n)."""
+
+    @abstractmethod
+    def _hold(self, points: Array, entries: Array, room: int) -> None:
+        """Use these samples, with all data of each in one row; sets for as much `room` share what is built."""
+
+    def _put(self, samples: Samples, room: int) -> None:
+        """Use these samples; matrices enter their rows column by column."""
+        data, N = samples.collect_data(self._loss.data, self._orientation), len(samples)
+        flat = [(part.transpose(0, 2, 1) if part.ndim == 3 else part).reshape(N, -1) for part in data]
+        self._ends = np.cumsum([part.shape[1] for part in flat], dtype=int)
+        self._points, self._entries = samples.points, np.concatenate([np.empty((N, 0)), *flat], axis=1)
+        self._hold(self._points, self._entries, room)
+
+    def batches(self, size: int, count: int, seed: tuple[int, ...]) -> Iterator[Self]:
+        """The same loss on `count` fresh sample sets of `size` each."""
+        for part in split_samples(self._draw(size * count, seed), count):
+            other = copy(self)
+            other._put(part, size)
+            yield other
+
+    def elsewhere(self, samples: Samples, weights: Mapping[str, float]) -> Self:
+        """Other terms of the same coordinates at other samples, with the same orientation.
+
+        Args:
+            samples: the samples.
+            weights: weights of the terms by name.
+        """
+        other = copy(self)
+        other._loss = Loss.of(self._loss.sizes, weights)
+        other._put(samples, len(samples))
+        return other
+
+    def part(self, places: NDArray[np.int_] | slice) -> Self:
+        """The same loss on some of its samples, in this order."""
+        other = copy(self)
+        other._points, other._entries = self._points[places], self._entries[places]
+        other._hold(other._points, other._entries, len(other._points))
+        return other
+
+
 class _Piece(NamedTuple):
     """Some of the samples."""
 
@@ -31,21 +100,12 @@ class _Piece(NamedTuple):
     shares: Array  #: weights of the samples in the mean, in blocks
 
 
-class ArrayObjective:
-    """Mean loss (25) of a network on fixed samples.
+class ArrayObjective(_SampledLoss):
+    """The loss of a network: NumPy computes the coordinate gradients, and pulls their derivatives back to theta.
 
-    NumPy computes the coordinate gradients and pulls their derivatives back to theta. CasADi computes the loss of a
-    sample and its derivative with respect to J_xi, always in double precision. Threads share pieces of samples, whose
-    sizes and order do not depend on the number of threads.
-
-    Args:
-        family: the coordinates.
-        samples: fixed samples of the family's joints.
-        weights: weights of the loss.
-        start: parameters, (size,), whose orientation the regularity term keeps.
-        draw: draws fresh samples.
-        single: whether the products of the network are computed in single precision.
-        orientation: sign of the volume of the coordinates that the regularity term keeps. Default: that of the start.
+    CasADi computes the loss of a sample and its derivative with respect to J_xi, always in double precision; with
+    `single`, the products of the network are computed in single precision. Threads share pieces of samples, whose sizes
+    and order do not depend on the number of threads.
     """
 
     def __init__(
@@ -58,17 +118,8 @@ class ArrayObjective:
         single: bool = False,
         orientation: float | None = None,
     ) -> None:
-        m, self.n = samples.task_jacobian.shape[1:]
-        self.r, self._family, self._draw = family.outputs, family, draw
-        self._single = single
-        self._memories = Memories()
-        self._loss = Loss.of(Sizes(self.n, m, self.r, samples.metric_inverse is None), weights.by_name)
-        self._orientation = orientation
-        # the start orients coordinates, at some of the samples
-        if orientation is None and (self._loss.oriented or weights.folds > 0):
-            some = samples[: RULES.orienting]
-            self._orientation = some.orientation(family.pullback(some.points, start)[0])
-        self._put(samples)
+        self._family, self._single, self._memories = family, single, Memories()
+        super().__init__(family, samples, weights, start, draw, orientation)
 
     def value(self, theta: Array) -> float:
         """L(theta)."""
@@ -81,7 +132,7 @@ class ArrayObjective:
     def value_and_gradient(self, theta: Array) -> tuple[float, Array]:
         """L(theta) and dL/dtheta."""
         # each piece: gradients of the network, loss and slopes by CasADi, slopes back to theta
-        small, columns = self._round(theta), build_loss_columns(self._loss)
+        small, columns, sizes = self._round(theta), build_loss_columns(self._loss), self._loss.sizes
 
         def part(tools: tuple[Run, ArrayMemory], work: tuple[_Piece, Array]) -> float:
             (run, memory), (piece, result) = tools, work
@@ -92,7 +143,7 @@ class ArrayObjective:
             for b, block in enumerate(entries):
                 run([block, *(array[b] for array in piece.data)], [losses[b], slopes[b]])
             slopes *= piece.shares[:, None]
-            by_entry = slopes.reshape(-1, self.n, self.r, slopes.shape[2])
+            by_entry = slopes.reshape(-1, sizes.n, sizes.r, slopes.shape[2])
             back(split_by_sample(by_entry, len(J)), result)
             return float(np.vdot(losses, piece.shares))
 
@@ -107,49 +158,22 @@ class ArrayObjective:
                 gradient += slopes
         return value, gradient
 
-    def batches(self, size: int, count: int, seed: tuple[int, ...]) -> Iterator[Self]:
-        """The same loss on `count` fresh sample sets of `size` each."""
-        for part in split_samples(self._draw(size * count, seed), count):
-            other = copy(self)
-            other._put(part)
-            yield other
-
-    def elsewhere(self, samples: Samples, weights: Mapping[str, float]) -> Self:
-        """Other terms of the same coordinates at other samples, with the same orientation.
-
-        Args:
-            samples: the samples.
-            weights: weights of the terms by name.
-        """
-        other = copy(self)
-        other._loss = Loss.of(self._loss.sizes, weights)
-        other._put(samples)
-        return other
-
-    def part(self, places: NDArray[np.int_] | slice) -> Self:
-        """The same loss on some of its samples, in this order."""
-        other = copy(self)
-        other._hold(self._points[places], self._entries[places])
-        return other
-
     def _round(self, theta: Array) -> Array:
         """Parameters with numbers of the type of the products."""
         return theta.astype(np.float32 if self._single else np.float64)
 
-    def _put(self, samples: Samples) -> None:
-        data = samples.collect_data(self._loss.data, self._orientation)
-        self._ends = np.cumsum([array[0].size for array in data], dtype=int)
-        self._hold(samples.points, _entries(data, len(samples)))
+    def _evaluate_jacobian(self, points: Array, theta: Array) -> Array:
+        return self._family.pullback(points, theta)[0]
 
-    def _hold(self, points: Array, entries: Array) -> None:
-        """Use these samples, with all data of each in one row, so that samples drawn at random are gathered at once."""
-        self._points, self._entries, self._arranged = points, entries, list[_Piece]()
+    def _hold(self, points: Array, entries: Array, room: int) -> None:
+        self._arranged = list[_Piece]()
 
     @property
     def _pieces(self) -> list[_Piece]:
         """The samples in pieces of nearly equal size, arranged once they are evaluated."""
         if not self._arranged:
-            N, most = len(self._points), max(RULES.least_piece, RULES.piece // (self.r * self._family.width))
+            N, entries = len(self._points), self._family.outputs * self._family.width
+            most = max(RULES.least_piece, RULES.piece // entries)
             size = ceil(N / ceil(N / most))
             for k in range(0, N, size):
                 *blocks, _ = np.split(arrange_blocks(self._entries[k : k + size]), self._ends, axis=1)
@@ -158,17 +182,8 @@ class ArrayObjective:
         return self._arranged
 
 
-class GraphObjective:
-    """Mean loss (25) of any family on fixed samples, with samples side by side as columns.
-
-    Args:
-        family: the coordinates.
-        samples: fixed samples of the family's joints.
-        weights: weights of the loss.
-        start: parameters, (size,), whose orientation the regularity term keeps.
-        draw: draws fresh samples.
-        orientation: sign of the volume of the coordinates that the regularity term keeps. Default: that of the start.
-    """
+class GraphObjective(_SampledLoss):
+    """The loss of any family, with samples side by side as columns of CasADi's graphs."""
 
     def __init__(
         self,
@@ -179,84 +194,47 @@ class GraphObjective:
         draw: Draw,
         orientation: float | None = None,
     ) -> None:
-        m, n = samples.task_jacobian.shape[1:]
-        loss = Loss.of(Sizes(n, m, family.outputs, samples.metric_inverse is None), weights.by_name)
-        self._graphs, self._draw, self._orientation = _Graphs(family, loss), draw, orientation
-        if orientation is None and (loss.oriented or weights.folds > 0):
-            self._orientation = _orientation(family, start, samples[: RULES.orienting])
-        self._put(samples, len(samples))
+        # graphs by loss and number of columns; copies of the objective share them
+        self._family, self._graphs = family, dict[tuple[Loss, int], _LossGraph]()
+        super().__init__(family, samples, weights, start, draw, orientation)
 
     def value(self, theta: Array) -> float:
         """L(theta)."""
-        return sum(block.run(theta, gradient=False)[0] for block in self._blocks)
+        start = np.ascontiguousarray(theta)
+        return sum(float(self._graph.value(start, *block)[0][0, 0]) for block in self._blocks)
 
     def value_and_gradient(self, theta: Array) -> tuple[float, Array]:
         """L(theta) and dL/dtheta."""
-        parts = [block.run(theta, gradient=True) for block in self._blocks]
-        return sum(value for value, _ in parts), np.sum([gradient for _, gradient in parts], axis=0)
+        start = np.ascontiguousarray(theta)
+        parts = [self._graph.both(start, *block) for block in self._blocks]
+        return sum(float(value[0, 0]) for value, _ in parts), np.sum([slopes[0] for _, slopes in parts], axis=0)
 
-    def batches(self, size: int, count: int, seed: tuple[int, ...]) -> Iterator[Self]:
-        """The same loss on `count` fresh sample sets of `size` each. They share their graphs."""
-        for part in split_samples(self._draw(size * count, seed), count):
-            other = copy(self)
-            other._put(part, size)
-            yield other
+    def _evaluate_jacobian(self, points: Array, theta: Array) -> Array:
+        q, parameters = ca.MX.sym("q", points.shape[1], len(points)), ca.MX.sym("theta", self._family.size)
+        gradients = ca.vertcat(*self._family.jacobian(q, parameters))
+        (J,) = NumpyGraph("J_xi", [q, parameters], [gradients])(
+            np.ascontiguousarray(points), np.ascontiguousarray(theta)
+        )
+        return J.reshape(len(points), self._family.outputs, -1)
 
-    def elsewhere(self, samples: Samples, weights: Mapping[str, float]) -> Self:
-        """Other terms of the same coordinates at other samples, with the same orientation.
-
-        Args:
-            samples: the samples.
-            weights: weights of the terms by name.
-        """
-        other = copy(self)
-        other._graphs = _Graphs(self._graphs.family, Loss.of(self._graphs.loss.sizes, weights))
-        other._put(samples, len(samples))
-        return other
-
-    def part(self, places: NDArray[np.int_] | slice) -> Self:
-        """The same loss on some of its samples, in this order."""
-        other = copy(self)
-        points = self._points[places]
-        other._divide(points, self._entries[places], len(points))
-        return other
-
-    def _put(self, samples: Samples, room: int) -> None:
-        described = samples.collect_data(self._graphs.loss.data, self._orientation)
-        self._divide(samples.points, _entries(described, len(samples)), room)
-
-    def _divide(self, points: Array, entries: Array, room: int) -> None:
-        """Use these samples. Graphs are built for `room` samples, so that smaller sets share them."""
-        self._points, self._entries = points, entries
-        graph = self._graphs.of_size(room)
-        self._blocks = [
-            _Block.filled(graph, points[k : k + graph.columns], entries[k : k + graph.columns], len(points))
-            for k in range(0, len(points), graph.columns)
-        ]
-
-
-@dataclass(frozen=True, eq=False)
-class _Graphs:
-    """The graphs of one loss, one for each number of columns."""
-
-    family: Family
-    loss: Loss
-    built: dict[int, "_LossGraph"] = field(default_factory=dict)
-
-    def of_size(self, samples: int) -> "_LossGraph":
-        """The graph for a set of samples: for all at once, or for as many as stay in the cache."""
-        most = max(1, RULES.graph // (self.family.outputs * self.family.width))
-        columns = ceil(samples / ceil(samples / most))
-        if columns not in self.built:
-            self.built[columns] = _LossGraph(self.family, self.loss, columns)
-        return self.built[columns]
+    def _hold(self, points: Array, entries: Array, room: int) -> None:
+        # a graph for all samples at once, or for as many as stay in the cache
+        columns = ceil(room / ceil(room / max(1, RULES.graph // (self._family.outputs * self._family.width))))
+        if (self._loss, columns) not in self._graphs:
+            self._graphs[self._loss, columns] = _LossGraph(self._family, self._loss, columns)
+        self._graph = self._graphs[self._loss, columns]
+        # points (c, n), data (entries, c) and shares (c,) of its columns; unused ones repeat samples with the weight 0
+        self._blocks = []
+        for k in range(0, len(points), columns):
+            own = k + np.arange(columns) % min(columns, len(points) - k)
+            share = np.where(np.arange(columns) < len(points) - k, 1 / len(points), 0.0)
+            self._blocks.append((np.ascontiguousarray(points[own]), np.ascontiguousarray(entries[own].T), share))
 
 
 class _LossGraph:
     """Loss and gradient of samples side by side: functions of theta, q (n, c), data (c, entries) and shares (c, 1)."""
 
     def __init__(self, family: Family, loss: Loss, columns: int) -> None:
-        self.columns = columns
         # the graph of one sample's loss, replayed on columns of samples
         theta, q = ca.MX.sym("theta", family.size), ca.MX.sym("q", loss.sizes.n, columns)
         data = ca.MX.sym("data", columns, sum(symbol.numel() for symbol in loss.symbols()))
@@ -283,40 +261,3 @@ class _LossGraph:
     def both(self) -> NumpyGraph:
         """The loss and its gradient."""
         return NumpyGraph("loss_and_gradient", self._inputs, [self._value, self._slope])
-
-
-@dataclass(frozen=True, eq=False)
-class _Block:
-    """Samples in the columns of a graph. Unused columns have weight 0."""
-
-    graph: _LossGraph
-    points: Array  #: (c, n)
-    data: Array  #: (entries, c)
-    share: Array  #: (c,)
-
-    @classmethod
-    def filled(cls, graph: _LossGraph, points: Array, data: Array, total: int) -> "_Block":
-        """Samples in blocks, with the weight 1 / total each. Unused columns repeat samples with the weight 0."""
-        kept = np.arange(graph.columns) % len(points)
-        share = np.where(np.arange(graph.columns) < len(points), 1 / total, 0.0)
-        return cls(graph, np.ascontiguousarray(points[kept]), np.ascontiguousarray(data[kept].T), share)
-
-    def run(self, theta: Array, gradient: bool) -> tuple[float, Array]:
-        """This block's share of the loss and of its gradient, which is empty unless requested."""
-        graph = self.graph.both if gradient else self.graph.value
-        value, *slopes = graph(np.ascontiguousarray(theta), self.points, self.data, self.share)
-        return float(value[0, 0]), slopes[0][0] if gradient else np.empty(0)
-
-
-def _entries(data: list[Array], samples: int) -> Array:
-    """Data of the samples as rows (N, entries), with matrices column by column."""
-    flat = [(part.transpose(0, 2, 1) if part.ndim == 3 else part).reshape(samples, -1) for part in data]
-    return np.concatenate([np.empty((samples, 0)), *flat], axis=1)
-
-
-def _orientation(family: Family, theta: Array, samples: Samples) -> float:
-    """Orientation of the coordinates with the given parameters."""
-    q, parameters = ca.MX.sym("q", samples.points.shape[1], len(samples)), ca.MX.sym("theta", family.size)
-    gradients = NumpyGraph("J_xi", [q, parameters], [ca.vertcat(*family.jacobian(q, parameters))])
-    (J,) = gradients(np.ascontiguousarray(samples.points), np.ascontiguousarray(theta))  # (N, r n)
-    return samples.orientation(J.reshape(len(samples), family.outputs, -1))

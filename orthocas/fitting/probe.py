@@ -14,8 +14,7 @@ from orthocas.charts.point_quality import in_the_metric, worst_points
 from orthocas.fitting.basis_objective import BasisObjective, build_gradients
 from orthocas.fitting.starts import find_spectral_start
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, Weights
-from orthocas.solvers.gauss_newton import GaussNewton
-from orthocas.solvers.lbfgs import QuasiNewton
+from orthocas.solvers.minimisers import GaussNewton, QuasiNewton
 from orthocas.solvers.protocol import Status
 from orthocas.tasks.domains import Box
 from orthocas.tasks.problem import (
@@ -209,34 +208,32 @@ class Prober:
                 if leap or quality.keeps(enough):
                     self._kept = self._start if quality.keeps(enough) else self._kept
                     return quality
-            # parameters, (size,)
             # even samples for the start, and more near faces and corners, where charts fail first
             even = sample_evenly(problem.domain, RULES.training, RULES.seed)
             heavy = sample_boundary_weighted(problem.domain, RULES.near_faces, RULES.seed + 1)
             samples = evaluate_samples(problem, np.vstack([even, heavy])).restricted_to(self.active)
             with deferred():
-                fresh = self._start is None
-                start = (
-                    find_spectral_start(family, samples[: len(even)]) if self._start is None else self._start.on(family)
-                )
-                objective = self._build_loss(problem, family, samples, start)
+                known = self._start
+                start = find_spectral_start(family, samples[: len(even)]) if known is None else known.on(family)
+                # the loss of the fit that confirms the box
+                if self._objective is None:
+                    weights = replace(self.weights.for_problem(problem), length=0.0, extra={})
+                    objective = BasisObjective(family, samples, weights, start, lambda count, seed: samples)
+                else:
+                    objective = self._objective.move_to(build_gradients(family, len(self.active)), samples, start)
+                self._objective = objective
             if self.outputs < RULES.many:
                 result = GaussNewton().coarser().minimise(objective, start)
+            elif known is None:
+                result = QuasiNewton().coarser().minimise(objective, start)
             else:
-                solver = QuasiNewton().coarser()
-                if fresh:
-                    result = solver.minimise(objective, start)
+                # the matrix of a box that is not much wider or narrower serves
+                width, steered = family.space.half_width, self._steered
+                if steered is None or np.abs(np.log(width / steered.half_width)).max() > np.log(RULES.other):
+                    self._steered = _Steered(objective, width, objective.curvature_estimate(start))
                 else:
-                    steered = self._steered
-                    if steered is None or np.abs(np.log(family.space.half_width / steered.half_width)).max() > np.log(
-                        RULES.other
-                    ):
-                        self._steered = _Steered(
-                            objective, family.space.half_width, objective.curvature_estimate(start)
-                        )
-                    else:
-                        self._steered = replace(steered, loss=objective)
-                    result = solver.minimise(self._steered, start)
+                    self._steered = replace(steered, loss=objective)
+                result = QuasiNewton().coarser().minimise(self._steered, start)
             if result.status is Status.INTERRUPTED:
                 raise KeyboardInterrupt
             theta: Array = result.theta
@@ -288,16 +285,6 @@ class Prober:
             return J
 
         return jacobian
-
-    def _build_loss(self, problem: Problem, family: ProductFamily, samples: Samples, start: Array) -> BasisObjective:
-        """The loss of the fit that confirms the box."""
-        objective = self._objective
-        if objective is None:
-            weights = replace(self.weights.for_problem(problem), length=0.0, extra={})
-            self._objective = BasisObjective(family, samples, weights, start, lambda count, seed: samples)
-        else:
-            self._objective = objective.move_to(build_gradients(family, len(self.active)), samples, start)
-        return self._objective
 
 
 def evaluate_chart(chart: Chart, samples: int, seed: int) -> Quality:

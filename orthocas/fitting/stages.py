@@ -1,11 +1,12 @@
-"""The stages of a fit, from low degrees to high ones. Each minimises an objective on samples, from a start."""
+"""The stages of a fit, from low degrees to high ones: each minimises an objective on samples. And their settings."""
 
-from collections.abc import Callable, Iterator, Sequence
+from __future__ import annotations
+
+from collections.abc import Callable
 from contextlib import nullcontext
-from dataclasses import dataclass, field, replace
-from functools import reduce
+from dataclasses import dataclass, replace
 from math import ceil
-from typing import Self
+from typing import Literal, Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,7 @@ from orthocas.bases.family import (
     JointSpace,
     LinearFamily,
     Parametrisation,
+    require_parametrisation,
 )
 from orthocas.bases.products import Fourier, Polynomial, ProductFamily
 from orthocas.charts.coordinates import Coordinates
@@ -25,24 +27,67 @@ from orthocas.charts.point_quality import WorstPoints, worst_points
 from orthocas.errors import InvalidValueError
 from orthocas.fitting.basis_objective import RULES as OBJECTIVE_RULES
 from orthocas.fitting.basis_objective import BasisGradients, BasisObjective, build_gradients, expand
-from orthocas.fitting.bounded_mutual import BoundedMutual, bound_mutual_angles
-from orthocas.fitting.like import LikeTerm
+from orthocas.fitting.combined import BoundedMutual, LinearSum, WeightedSum, bound_mutual_angles
+from orthocas.fitting.like import RULES as LIKE_RULES
+from orthocas.fitting.like import Like, Likeness, LikeTerm
 from orthocas.fitting.network_objective import ArrayObjective, GraphObjective
-from orthocas.fitting.settings import RULES, FitSettings
 from orthocas.fitting.starts import Mirror, find_mirror, find_spectral_start
-from orthocas.fitting.terms import FOLD_TERM
+from orthocas.fitting.terms import FOLD_TERM, WeightNumbers, Weights, register_loss_term
 from orthocas.fitting.terms import RULES as LOSS_RULES
-from orthocas.solvers.gauss_newton import GaussNewton
-from orthocas.solvers.protocol import Objective, SampledObjective, Solver, SolveResult, Status
+from orthocas.solvers.casadi_solvers import Ipopt
+from orthocas.solvers.minimisers import LBFGS, GaussNewton, QuasiNewton
+from orthocas.solvers.protocol import Objective, Solver, SolveResult, Status
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.samples import Samples, evaluate_samples, sample_evenly, sample_problem
 from orthocas.tools.batch import one_blas_thread
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array, require_memory
+from orthocas.tools.checks import Array, as_number, require_count, require_kind, require_known, require_memory
 from orthocas.tools.interrupts import deferred
 from orthocas.tools.progress import Monitor, Progress, Watch
 
 Begin = Callable[[ProductFamily], Array | None]  #: parameters to start from, (size,), if some are known
+Precision = Literal["double", "single"]
+PRECISIONS: tuple[Precision, ...] = ("double", "single")  #: of the large products of a fit
+
+
+@dataclass(frozen=True, slots=True)
+class FitRules:
+    """Numbers of fits. Chosen on the planar arms and the iiwa, held on the arms of docs/which_tool.md."""
+
+    default_degree: int = 5
+    degree_with_bound: int = 4  #: with a bound on mutual angles
+    lower_degrees: tuple[tuple[int, int], ...] = ((8, 4), (9, 3), (12, 2))  #: joints, and the degree from there on
+    many_joints: int = 8  #: with more, coordinates are many as well, and the matrix grows with their square
+    many_terms: int = 300  #: where a Gauss-Newton matrix takes longer than ten gradients: degree 4 for seven joints
+    least_bound_deg: float = 1e-6  #: on mutual angles; rounding hides smaller ones
+
+    least_samples: int = 1000  #: of bases
+    residuals: int = 140  #: per coefficient, for which samples are drawn beyond these
+    residuals_in_metric: int = 70  #: the same in another metric than the identity: leaks are of the same size
+    renewal_in_metric: float = 0.95  #: of the matrix of QuasiNewton there, where losses fall along long valleys
+    tolerance_of_many: float = 1e-3  #: of the solver for many joints: half the time, and leaks are 2 % larger
+    residuals_of_many: int = 100  #: the same for coordinates of many joints, and nothing beyond them
+    network_samples: int = 2000  #: of families that are not linear in their parameters
+    first: int = 200  #: samples that scale coordinates
+    first_tag: int = 1000  #: their seed tag; stages use other tags
+    fresh_tag: int = 2000  #: seed tag of samples drawn while a solver runs
+    start_seed: int = 0  #: of the samples of spectral starts, the same for all fits
+    trial_degree: int = 3  #: of the trial that chooses among symmetric coordinates
+
+    searched: int = 3  #: degree from which worst points are searched: those of lower degrees differ from the last ones
+    rounds: int = 4  #: of the last degree, with the worst points
+    least_gain: float = 0.01  #: of the conditioning in a round
+    collected: float = 1.5 * 0.2  #: conditioning below which points are collected, before they become worse
+    digits: int = 6  #: of gradients at the centre that count for the order: fits end with about as many
+
+    bound_step: float = 0.05  #: of the bounds on the relative singular value that are offered
+    failed: float = 0.05  #: conditioning below which a chart is of no use; folds have less than 0
+    failed_fraction: float = 0.9  #: of such points that a bound should leave out
+    largest_bound: float = 0.25  #: charts that fail at larger singular values have other reasons
+    any_bound: float = 1e-12  #: of a ClearBox that only measures
+
+
+RULES = FitRules()
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,7 +99,7 @@ class Stage:
     samples: int
     result: SolveResult
 
-    def mark_interrupted(self) -> "Stage":
+    def mark_interrupted(self) -> Stage:
         """The same stage, marked as interrupted by Ctrl-C."""
         return replace(self, result=replace(self.result, status=Status.INTERRUPTED))
 
@@ -81,31 +126,49 @@ class Continuation:
     where the domain holds singular positions, the domain forces them: then the last stage leaves the fold term out.
 
     Args:
-        runner: runs single stages.
-        r: number of coordinates of the active joints.
+        problem: problem of the fit.
+        settings: its settings.
+        active: joints that are not coordinates themselves.
+        monitor: called with progress.
+        folds: collects worst points.
+        like: what the first coordinates follow.
         begin: gives parameters of polynomials to start from, instead of a spectral start. Without a mirror only, since
             coordinates of another fit need not be even and odd.
     """
 
-    def __init__(self, runner: "StageRunner", r: int, begin: Begin | None = None) -> None:
-        self._runner, self._r, self._begin = runner, r, begin
+    def __init__(
+        self,
+        problem: Problem,
+        settings: FitSettings,
+        active: list[int],
+        monitor: Monitor,
+        folds: FoldSearch,
+        like: LikeTerm | None = None,
+        begin: Begin | None = None,
+    ) -> None:
+        self.problem, self.settings, self.active, self.monitor = problem, settings, active, monitor
+        self.folds, self.like, self.begin = folds, like, begin
+        self.space, self.r = JointSpace.of(problem).restricted_to(active), len(active) - problem.m
         self._stages: list[Stage] = []
         self._reached: tuple[Parametrisation, Family] | None = None
+        # what is built once: families by label, gradients of bases, spectral starts by number of samples and mirror
+        self._families: dict[str, Family] = {}
+        self._bases: dict[LinearFamily, BasisGradients] = {}
+        self._starts: dict[tuple[LinearFamily, int, bool], Array] = {}
 
     def run(self) -> Solution:
         """Run all stages. After Ctrl-C, the last one is marked as interrupted."""
-        runner, folds = self._runner, self._runner.folds
         # degree by degree, if the family has degrees
-        target = runner.settings.parametrisation
+        target, folds = self.settings.parametrisation, self.folds
         steps: list[Parametrisation] = [target]
         if isinstance(target, GradedParametrisation):
-            runner.require_memory(target, self._r)
+            self._require_memory(target)
             steps = [target.of_degree(degree) for degree in range(min(target.degree, 2), target.degree + 1)]
+        last, before = steps[-1], 0.0
         try:
             for step in steps:
-                self._solve(step, step.label, final=step is steps[-1])
+                self._solve(step, step.label, final=step is last)
             # the last one again, until there is no point of small conditioning, or its conditioning no longer grows
-            last, before = steps[-1], 0.0
             for k in range(2, 2 + RULES.rounds):
                 unfolded = folds.least >= LOSS_RULES.least_conditioning
                 settled = 0 <= folds.least < before + RULES.least_gain
@@ -122,33 +185,85 @@ class Continuation:
                 raise
             self._stages[-1] = self._stages[-1].mark_interrupted()
         assert self._reached is not None
-        return Solution(tuple(self._stages), self._reached[0], self._runner.folds.worst)
+        return Solution(tuple(self._stages), self._reached[0], folds.worst)
 
     def _solve(self, step: Parametrisation, label: str, final: bool) -> None:
-        """Run a stage, and search the worst points of its result."""
-        runner, degree = self._runner, step.degree if isinstance(step, GradedParametrisation) else 0
-        # The family on the active joints, from the last result. Only the last degree is solved exactly, but in another
-        # metric than the identity: the loss has long valleys there, and steps of low degrees cost little.
-        family, solver = runner.family(step, self._r), runner.settings.solver
-        if not final and runner.problem.metric.is_identity:
-            solver = solver.coarser()
-        stage = runner.run(Plan(label, family, self._start(family), solver, degree, final))
+        """Run a stage from the last result, and search the worst points of its own.
+
+        Raises:
+            SolveError: if there is no usable point. Only the final stage has to satisfy a bound on mutual angles.
+        """
+        settings, problem, family = self.settings, self.problem, self._family(step)
+        degree = step.degree if isinstance(step, GradedParametrisation) else 0
+        # Only the last degree is solved exactly, but in another metric than the identity: the loss has long valleys
+        # there, and steps of low degrees cost little.
+        solver = settings.solver if final or not problem.metric.is_identity else settings.solver.coarser()
+        # samples: half of them where a mirror symmetry halves the coefficients
+        mirror = self.mirror
+        kept = mirror.kept(family) if isinstance(family, LinearFamily) and mirror is not None else None
+        count = self._count_samples(family, kept)
+        self.monitor(Progress(label, 0.0, f"sampling {count} points"))
+        # graphs of other families are few large products: they need the threads of BLAS more than the last digits
+        with one_blas_thread() if isinstance(family, LinearFamily | ArrayFamily) else nullcontext():
+            samples = self._sample(count, (settings.seed, 1 + degree))
+            # CasADi may swallow Ctrl-C while graphs are built
+            with deferred():
+                objective, start = self._build_objective(label, family, samples, None if kept is None else mirror)
+            result = solver.minimise(objective, start, Watch(self.monitor, label))
+        # a bound on mutual angles has to be met in the end only
+        if isinstance(objective, BoundedMutual) and not np.isfinite(result.value):
+            if final:
+                assert settings.max_mutual is not None
+                raise objective.explain_missed_bound(label, settings.max_mutual, result)
+        else:
+            result.raise_if_failed()
+        # back from the free components to all coefficients
+        if kept is not None and mirror is not None:
+            result = replace(result, theta=mirror.coordinates(expand(result.theta, kept)))
+        stage = Stage(label, family.size, len(samples), result)
         self._stages.append(stage)
         self._reached = step, family
         # the worst points of low degrees differ from those of the last one
-        if stage.result.status is Status.INTERRUPTED:
+        if result.status is Status.INTERRUPTED:
             raise KeyboardInterrupt
         if final or degree >= RULES.searched:
-            runner.folds.search(stage, step, len(self._stages), runner.monitor)
+            self.folds.search(stage, step, len(self._stages), self.monitor)
 
-    def _start(self, family: Family) -> Array | None:
-        """The last result, embedded; at first that of `begin`."""
+    def _build_objective(
+        self, label: str, family: Family, samples: Samples, mirror: Mirror | None
+    ) -> tuple[Objective, Array]:
+        """The loss of a family on samples, and the start in the parameters that it leaves free."""
+        theta, settings = self._embed_last(family), self.settings
+        # linear families: least squares in their coefficients
+        if isinstance(family, LinearFamily):
+            objective, start = self._build_in_basis(family, samples, theta, mirror)
+            if settings.max_mutual is None:
+                return self.folds.add_to(objective), start
+            return bound_mutual_angles(objective, start, settings.max_mutual, self.problem.r, fresh=theta is None)
+        # all others: networks by arrays, anything else by CasADi's graphs
+        if settings.max_mutual is not None:
+            expected = "a parametrisation linear in its parameters, such as polynomial"
+            raise InvalidValueError("max_mutual_deg", f"given with {label}", expected)
+        # with the state of the solver
+        numbers = 60 * family.size + 100 * len(samples) * self.space.n
+        require_memory(f"{label} with {family.size} parameters", 8.0 * numbers)
+        start, single = family.initial(settings.seed) if theta is None else theta, settings.precision == "single"
+        if isinstance(family, ArrayFamily):
+            network = ArrayObjective(family, samples, settings.weights, start, self._draw, single)
+            return self.folds.add_to(network), start
+        if single:
+            label = settings.parametrisation.label
+            raise InvalidValueError("precision", f"'single' with {label}", "double, or a basis or a network (mlp)")
+        return self.folds.add_to(GraphObjective(family, samples, settings.weights, start, self._draw)), start
+
+    def _embed_last(self, family: Family) -> Array | None:
+        """The last result in a family, (size,); at first that of `begin`, or None if a start has to be found."""
         if self._reached is None:
-            polynomials = isinstance(self._runner.settings.parametrisation, Polynomial)
-            if self._begin is None or not polynomials or self._runner.mirror is not None:
+            polynomials = isinstance(self.settings.parametrisation, Polynomial)
+            if self.begin is None or not polynomials or self.mirror is not None:
                 return None
             assert isinstance(family, ProductFamily)
-            return self._begin(family)
+            return self.begin(family)
         # a basis of higher degree contains the last one
         theta, before = self._stages[-1].result.theta, self._reached[1]
         if theta.size == family.size:
@@ -156,6 +271,108 @@ class Continuation:
         assert isinstance(family, GradedFamily)
         assert isinstance(before, GradedFamily)
         return family.embed(theta, before)
+
+    def _build_in_basis(
+        self, family: LinearFamily, samples: Samples, theta: Array | None, mirror: Mirror | None
+    ) -> tuple[BasisObjective, Array]:
+        """The loss of a family that is linear in its parameters, and the start in those that a mirror leaves free."""
+        kept = None if mirror is None else mirror.kept(family)
+        key = family, len(samples), kept is not None
+        if theta is None and key not in self._starts:
+            # it does not depend on the seed: eigenvalues are close, so other samples would mix coordinates
+            even = self._sample(len(samples), RULES.start_seed)
+            start = find_spectral_start(family, even, kept, self._gradients(family))
+            # quantities to follow choose among coordinates of equal loss
+            if self.like is not None:
+                start = self.like.turn(family, start, even, self._gradients(family))
+            self._starts[key] = start
+        # the start as components, which a mirror leaves even or odd, and of these the free ones
+        if theta is None:
+            theta = self._starts[key]
+        elif mirror is not None:
+            theta = mirror.components(theta)
+        theta = theta if kept is None else theta.reshape(kept.shape)[kept]
+        exchanged = () if mirror is None else mirror.exchanged
+        objective = BasisObjective(
+            family, samples, self.settings.weights, theta, self._draw, kept, exchanged, self._gradients(family)
+        )
+        return objective, theta
+
+    def _family(self, parametrisation: Parametrisation) -> Family:
+        """The family on the active joints: the same object every time, so that what it needs is built once."""
+        label = parametrisation.label
+        if label not in self._families:
+            self._families[label] = parametrisation.family(self.space, self.r)
+        return self._families[label]
+
+    @cached_property
+    def mirror(self) -> Mirror | None:
+        """The symmetry that halves the coefficients; a bound on mutual angles, or a meaning, is met without one.
+
+        Of the coordinates that it allows, those with the least loss at degree 3 are chosen.
+        """
+        free = self.settings.max_mutual is None and self.like is None
+        mirror = find_mirror(self.problem, self.active) if free else None
+        target = self.settings.parametrisation
+        if mirror is None or not isinstance(target, GradedParametrisation):
+            return mirror
+        family = self._family(target.of_degree(min(target.degree, RULES.trial_degree)))
+        assert isinstance(family, LinearFamily)
+        return min(mirror.list_choices(), key=lambda choice: self._try(family, choice))
+
+    def _try(self, family: LinearFamily, mirror: Mirror) -> float:
+        """The loss that a family reaches with these symmetric coordinates."""
+        samples = self._sample(self._count_samples(family, mirror.kept(family)), (self.settings.seed, 0))
+        with one_blas_thread():
+            with deferred():
+                objective, start = self._build_in_basis(family, samples, None, mirror)
+            result = GaussNewton().coarser().minimise(objective, start)
+        if result.status is Status.INTERRUPTED:
+            raise KeyboardInterrupt
+        return result.value
+
+    def _require_memory(self, target: GradedParametrisation) -> None:
+        """Refuse a degree that exceeds the memory, before building anything."""
+        n, r, half = self.space.n, self.r, 1 if self.mirror is None else 2
+        K = target.term_count(n)
+        N = self._count_for_basis(K, r) / half
+        # numbers of the basis at a sample, see `BasisGradients`; they are there twice while they are built
+        of_a_joint = K - target.term_count(n - 1) if n > 1 else K
+        numbers = 1 + K if isinstance(target, Polynomial | Fourier) else n * of_a_joint
+        gradients = 2 * (4 if self.settings.precision == "single" else 8) * numbers + 4 * n * K / OBJECTIVE_RULES.stride
+        curvature = 16 * (n * r) ** 2 if self.settings.max_mutual is not None else 0
+        needed = N * (gradients + curvature) + 32 * (r * K / half) ** 2
+        require_memory(f"{target.label} on {n} joints with {K} basis functions", needed)
+
+    def _count_samples(self, family: Family, kept: NDArray[np.bool_] | None) -> int:
+        """Number of samples of a family. A sample of a mirror symmetric problem counts twice."""
+        if not isinstance(family, LinearFamily):
+            return self.settings.samples or RULES.network_samples
+        count = self._count_for_basis(family.width, family.outputs)
+        return count if kept is None or self.settings.samples else ceil(count / 2)
+
+    def _count_for_basis(self, terms: int, r: int) -> int:
+        """Number of samples for a linear family, so that there are 70 to 140 residuals per coefficient."""
+        rows = self.problem.m + r - 1
+        if self.problem.n > RULES.many_joints:
+            return self.settings.samples or ceil(RULES.residuals_of_many * terms / rows)
+        residuals = RULES.residuals if self.problem.metric.is_identity else RULES.residuals_in_metric
+        return self.settings.samples or RULES.least_samples + ceil(residuals * terms / rows)
+
+    def _sample(self, count: int, seed: int | tuple[int, ...]) -> Samples:
+        points = sample_evenly(self.problem.domain, count, seed)
+        return evaluate_samples(self.problem, points).restricted_to(self.active)
+
+    def _draw(self, count: int, seed: tuple[int, ...]) -> Samples:
+        fresh = sample_problem(self.problem, count, (self.settings.seed, RULES.fresh_tag, *seed))
+        return fresh.restricted_to(self.active)
+
+    def _gradients(self, family: LinearFamily) -> BasisGradients:
+        """Gradients of a basis, built once."""
+        if family not in self._bases:
+            number = np.float32 if self.settings.precision == "single" else np.float64
+            self._bases[family] = build_gradients(family, self.space.n, number)
+        return self._bases[family]
 
 
 class FoldSearch:
@@ -205,285 +422,108 @@ class FoldSearch:
         return (LinearSum if isinstance(objective, BasisObjective) else WeightedSum)([(1.0, objective), (1.0, penalty)])
 
 
-class WeightedSum:
-    """A sum of losses of the same parameters on several sets of samples, each times a weight.
+@dataclass(frozen=True)
+class FitSettings:
+    """All settings that determine the result of a fit."""
 
-    Only the first one may draw fresh samples, such as the loss on the domain beside a penalty on its worst points.
-    """
-
-    def __init__(self, parts: Sequence[tuple[float, Objective]]) -> None:
-        self.parts = parts
-
-    def value(self, theta: Array) -> float:
-        """The sum at theta (size,)."""
-        return sum(weight * part.value(theta) for weight, part in self.parts)
-
-    def value_and_gradient(self, theta: Array) -> tuple[float, Array]:
-        """The sum and its gradient, (size,)."""
-        results = [(weight, *part.value_and_gradient(theta)) for weight, part in self.parts]
-        value = sum(weight * value for weight, value, _ in results)
-        return value, _add([weight * slope for weight, _, slope in results])
-
-    def batches(self, size: int, count: int, seed: tuple[int, ...]) -> Iterator[Self]:
-        """The first loss on fresh samples, each time with the same others."""
-        (weight, first), *others = self.parts
-        assert isinstance(first, SampledObjective)
-        for loss in first.batches(size, count, seed):
-            yield type(self)([(weight, loss), *others])
-
-
-class LinearSum(WeightedSum):
-    """A weighted sum for families linear in theta, with second derivatives."""
-
-    def normal_equations(self, theta: Array) -> tuple[float, Array, Array]:
-        """The sum, its gradient and its Gauss-Newton matrix."""
-        results = [(weight, *part.normal_equations(theta)) for weight, part in self._solve_least_squares]
-        value = sum(weight * value for weight, value, _, _ in results)
-        slopes = _add([weight * slope for weight, _, slope, _ in results])
-        return value, slopes, _add([weight * H for weight, *_, H in results])
-
-    def curvature_estimate(self, theta: Array) -> list[Array]:
-        """A rough Gauss-Newton matrix of the sum, in blocks."""
-        parts = [(weight, part.curvature_estimate(theta)) for weight, part in self._solve_least_squares]
-        return [
-            _add([weight * block for (weight, _), block in zip(parts, blocks, strict=True)])
-            for blocks in zip(*(blocks for _, blocks in parts), strict=True)
-        ]
-
-    def hessian(self, theta: Array) -> Array:
-        """The Hessian of the sum."""
-        return _add([weight * part.hessian(theta) for weight, part in self._solve_least_squares])
-
-    @property
-    def _solve_least_squares(self) -> list[tuple[float, BasisObjective]]:
-        return [(weight, part) for weight, part in self.parts if isinstance(part, BasisObjective)]
-
-
-def _add(arrays: Sequence[Array]) -> Array:
-    return np.asarray(reduce(np.add, arrays))
-
-
-class Resampled:
-    """A loss of networks on some of its samples. Steps take others, drawn from all.
-
-    Args:
-        whole: the loss on all samples.
-        watched: places of the samples on which it is watched.
-        count: number of all samples.
-    """
-
-    def __init__(self, whole: ArrayObjective | GraphObjective, watched: NDArray[np.int_], count: int) -> None:
-        self._whole, self._count = whole, count
-        self._watched = whole.part(watched)
-
-    def value(self, theta: Array) -> float:
-        """The mean over the samples that are watched."""
-        return self._watched.value(theta)
-
-    def value_and_gradient(self, theta: Array) -> tuple[float, Array]:
-        """The mean over the samples that are watched, and its gradient."""
-        return self._watched.value_and_gradient(theta)
-
-    def batches(self, size: int, count: int, seed: tuple[int, ...]) -> Iterator[Objective]:
-        """The mean over `size` samples drawn from all, `count` times."""
-        rng, size = np.random.default_rng(seed), min(size, self._count)
-        while count > 0:
-            # all samples are gathered once in a random order: parts of them need no copies
-            shuffled = self._whole.part(rng.permutation(self._count)[: count * size])
-            for start in range(0, min(count * size, self._count - size + 1), size):
-                yield shuffled.part(slice(start, start + size))
-                count -= 1
-
-
-@dataclass(frozen=True, eq=False)
-class Plan:
-    """What one stage does."""
-
-    label: str  #: name of the stage, unique within a fit
-    family: Family
-    start: Array | None  #: parameters of the family, (size,); None: a start has to be found
+    parametrisation: Parametrisation
     solver: Solver
-    tag: int  #: seed tag of the samples
-    final: bool  #: whether a bound on mutual angles has to be met
+    weights: Weights
+    samples: int | None
+    seed: int
+    max_mutual_deg: float | None
+    split_idle: bool = True
+    precision: Precision = "double"
+    like: Like | None = None
 
-
-@dataclass(frozen=True, eq=False)
-class StageRunner:
-    """Runs single stages of one fit, and holds what they share."""
-
-    problem: Problem
-    settings: FitSettings
-    active: list[int]  #: joints that are not coordinates themselves
-    monitor: Monitor
-    folds: FoldSearch
-    like: LikeTerm | None = None  #: what the first coordinates follow
-    _families: dict[tuple[str, int], Family] = field(default_factory=dict)
-    _bases: dict[LinearFamily, BasisGradients] = field(default_factory=dict)  #: gradients of the bases so far
-    #: spectral starts so far, by family, number of samples, and whether a mirror is used
-    _starts: dict[tuple[LinearFamily, int, bool], Array] = field(default_factory=dict)
-
-    def run(self, plan: Plan) -> Stage:
-        """Draw samples, find a start if none is given, and minimise.
+    @classmethod
+    def check(
+        cls,
+        problem: Problem,
+        parametrisation: Parametrisation | None,
+        solver: Solver | None,
+        weights: Weights | WeightNumbers,
+        samples: int | None,
+        seed: int,
+        max_mutual_deg: float | None,
+        split_idle: bool = True,
+        precision: Precision = "double",
+        like: Likeness | None = None,
+    ) -> FitSettings:
+        """Check the settings, and fill in the default parametrisation, solver and angles.
 
         Raises:
-            SolveError: if there is no usable point. Only the final stage has to satisfy a bound on mutual angles.
+            InvalidValueError, ShapeError: if a setting is invalid, or contradicts another one.
         """
-        # samples: half of them where a mirror symmetry halves the coefficients
-        family, mirror = plan.family, self.mirror
-        kept = mirror.kept(family) if isinstance(family, LinearFamily) and mirror is not None else None
-        count = self._count_samples(family, kept)
-        self.monitor(Progress(plan.label, 0.0, f"sampling {count} points"))
-        # graphs of other families are few large products: they need the threads of BLAS more than the last digits
-        with one_blas_thread() if isinstance(family, LinearFamily | ArrayFamily) else nullcontext():
-            samples = self._sample(count, 1 + plan.tag)
-            # CasADi may swallow Ctrl-C while graphs are built
-            with deferred():
-                objective, start = self._build_objective(plan, samples, None if kept is None else mirror)
-            result = plan.solver.minimise(objective, start, Watch(self.monitor, plan.label))
-        # a bound on mutual angles has to be met in the end only
-        if isinstance(objective, BoundedMutual) and not np.isfinite(result.value):
-            if plan.final:
-                assert self.settings.max_mutual is not None
-                raise objective.explain_missed_bound(plan.label, self.settings.max_mutual, result)
-        else:
-            result.raise_if_failed()
-        # back from the free components to all coefficients
-        if kept is not None and mirror is not None:
-            result = replace(result, theta=mirror.coordinates(expand(result.theta, kept)))
-        return Stage(plan.label, family.size, len(samples), result)
+        # the family, for this problem
+        require_kind("problem", problem, Problem)
+        if parametrisation is None:
+            parametrisation = choose_parametrisation(problem, bounded=max_mutual_deg is not None)
+        require_parametrisation(parametrisation)
+        bound = parametrisation.for_problem(problem)
+        if max_mutual_deg is not None:
+            max_mutual_deg = _check_bound(bound, max_mutual_deg)
+        # the solver; only Ipopt knows bounds
+        if solver is None:
+            solver = choose_solver(bound, problem) if max_mutual_deg is None else Ipopt()
+        if not isinstance(solver, Solver) or isinstance(solver, type):
+            raise InvalidValueError("solver", repr(solver), "an object such as GaussNewton()")
+        if max_mutual_deg is not None and not isinstance(solver, Ipopt):
+            raise InvalidValueError("solver", solver.name, "ipopt, the only solver that supports max_mutual_deg")
+        count = None if samples is None else require_count("samples", samples, least=2)
+        loss = Weights.of(weights).for_problem(problem)
+        require_kind("split_idle", split_idle, bool)
+        require_known("precision", precision, PRECISIONS)
+        if precision == "single" and max_mutual_deg is not None:
+            raise InvalidValueError("precision", "'single' with max_mutual_deg", "double: Ipopt needs its digits")
+        tag = require_count("seed", seed, least=0)
+        if like is not None and (max_mutual_deg is not None or bound.closed_form is not None):
+            other = bound.label if max_mutual_deg is None else "max_mutual_deg"
+            raise InvalidValueError("like", f"given with {other}", "a fit of the weighted loss")
+        quantities = None if like is None else Like.of(problem, like)
+        return cls(bound, solver, loss, count, tag, max_mutual_deg, split_idle, precision, quantities)
 
-    def _build_objective(self, plan: Plan, samples: Samples, mirror: Mirror | None) -> tuple[Objective, Array]:
-        """The loss of a family on samples, and the start in the parameters that it leaves free."""
-        family, theta, settings = plan.family, plan.start, self.settings
-        # linear families: least squares in their coefficients
-        if isinstance(family, LinearFamily):
-            objective, start = self._build_in_basis(family, samples, theta, mirror)
-            if settings.max_mutual is None:
-                return self.folds.add_to(objective), start
-            return bound_mutual_angles(objective, start, settings.max_mutual, self.problem.r, fresh=theta is None)
-        # all others: networks by arrays, anything else by CasADi's graphs
-        if settings.max_mutual is not None:
-            expected = "a parametrisation linear in its parameters, such as polynomial"
-            raise InvalidValueError("max_mutual_deg", f"given with {plan.label}", expected)
-        # with the state of the solver
-        numbers = 60 * family.size + 100 * len(samples) * self.space.n
-        require_memory(f"{plan.label} with {family.size} parameters", 8.0 * numbers)
-        start = family.initial(settings.seed) if theta is None else theta
-        if isinstance(family, ArrayFamily):
-            network = ArrayObjective(family, samples, settings.weights, start, self._draw, settings.single)
-            return self.folds.add_to(network), start
-        if settings.single:
-            label = settings.parametrisation.label
-            raise InvalidValueError("precision", f"'single' with {label}", "double, or a basis or a network (mlp)")
-        return self.folds.add_to(GraphObjective(family, samples, settings.weights, start, self._draw)), start
-
-    def _build_in_basis(
-        self, family: LinearFamily, samples: Samples, theta: Array | None, mirror: Mirror | None
-    ) -> tuple[BasisObjective, Array]:
-        """The loss of a family that is linear in its parameters, and the start in those that a mirror leaves free."""
-        kept = None if mirror is None else mirror.kept(family)
-        # the start as components, which a mirror leaves even or odd, and of these the free ones
-        if theta is None:
-            theta = self._start_spectral(family, len(samples), kept)
-        elif mirror is not None:
-            theta = mirror.components(theta)
-        theta = theta if kept is None else theta.reshape(kept.shape)[kept]
-        exchanged = () if mirror is None else mirror.exchanged
-        objective = BasisObjective(
-            family, samples, self.settings.weights, theta, self._draw, kept, exchanged, self._gradients(family)
-        )
-        return objective, theta
-
-    def _start_spectral(self, family: LinearFamily, count: int, kept: NDArray[np.bool_] | None) -> Array:
-        """A start that does not depend on the seed: eigenvalues are close, so other samples would mix coordinates."""
-        key = family, count, kept is not None
-        if key not in self._starts:
-            points = sample_evenly(self.problem.domain, count, RULES.start_seed)
-            samples = evaluate_samples(self.problem, points).restricted_to(self.active)
-            start = find_spectral_start(family, samples, kept, self._gradients(family))
-            # quantities to follow choose among coordinates of equal loss
-            if self.like is not None:
-                start = self.like.turn(family, start, samples, self._gradients(family))
-            self._starts[key] = start
-        return self._starts[key]
+    def add_term(self, term: LikeTerm) -> Self:
+        """The settings with the term that holds coordinates to quantities among the weights."""
+        register_loss_term(term)
+        return replace(self, weights=replace(self.weights, extra={**self.weights.extra, term.name: LIKE_RULES.weight}))
 
     @property
-    def space(self) -> JointSpace:
-        """The active joints."""
-        return JointSpace.of(self.problem).restricted_to(self.active)
+    def max_mutual(self) -> float | None:
+        """Bound on the root mean square mutual angle's deviation from a right angle [rad]."""
+        return None if self.max_mutual_deg is None else float(np.radians(self.max_mutual_deg))
 
-    def family(self, parametrisation: Parametrisation, r: int) -> Family:
-        """The family on the active joints: the same object every time, so that what it needs is built once."""
-        key = parametrisation.label, r
-        if key not in self._families:
-            self._families[key] = parametrisation.family(self.space, r)
-        return self._families[key]
+    def fold_weight(self, problem: Problem) -> float:
+        """Weight of the fold term; 0 on a torus, where every coordinate has critical points, and with a bound."""
+        free = not problem.domain.full_turns and self.max_mutual_deg is None
+        return self.weights.folds if free else 0.0
 
-    @cached_property
-    def mirror(self) -> Mirror | None:
-        """The symmetry that halves the coefficients; a bound on mutual angles, or a meaning, is met without one.
 
-        Of the coordinates that it allows, those with the least loss at degree 3 are chosen.
-        """
-        free = self.settings.max_mutual is None and self.like is None
-        mirror = find_mirror(self.problem, self.active) if free else None
-        target = self.settings.parametrisation
-        if mirror is None or not isinstance(target, GradedParametrisation):
-            return mirror
-        family = self.family(target.of_degree(min(target.degree, RULES.trial_degree)), len(mirror.parities))
-        assert isinstance(family, LinearFamily)
-        return min(mirror.list_choices(), key=lambda choice: self._try(family, choice))
+def choose_parametrisation(problem: Problem, bounded: bool) -> Polynomial:
+    """Polynomials of degree 5; of 4 with a bound or 8 joints, of 3 with more, of 2 from 12: terms grow too many."""
+    fewer = [degree for joints, degree in RULES.lower_degrees if problem.n >= joints]
+    return Polynomial(
+        degree=min(RULES.degree_with_bound if bounded else RULES.default_degree, *fewer, RULES.default_degree)
+    )
 
-    def _try(self, family: LinearFamily, mirror: Mirror) -> float:
-        """The loss that a family reaches with these symmetric coordinates."""
-        samples = self._sample(self._count_samples(family, mirror.kept(family)), 0)
-        with one_blas_thread():
-            with deferred():
-                objective, start = self._build_in_basis(family, samples, None, mirror)
-            result = GaussNewton().coarser().minimise(objective, start)
-        if result.status is Status.INTERRUPTED:
-            raise KeyboardInterrupt
-        return result.value
 
-    def require_memory(self, target: GradedParametrisation, r: int) -> None:
-        """Refuse a degree that exceeds the memory, before building anything."""
-        n, half = self.space.n, 1 if self.mirror is None else 2
-        K = target.term_count(n)
-        N = self._count_for_basis(K, r) / half
-        # numbers of the basis at a sample, see `BasisGradients`; they are there twice while they are built
-        of_a_joint = K - target.term_count(n - 1) if n > 1 else K
-        numbers = 1 + K if isinstance(target, Polynomial | Fourier) else n * of_a_joint
-        gradients = 2 * (4 if self.settings.single else 8) * numbers + 4 * n * K / OBJECTIVE_RULES.stride
-        curvature = 16 * (n * r) ** 2 if self.settings.max_mutual is not None else 0
-        needed = N * (gradients + curvature) + 32 * (r * K / half) ** 2
-        require_memory(f"{target.label} on {self.space.n} joints with {K} basis functions", needed)
+def choose_solver(parametrisation: Parametrisation, problem: Problem) -> Solver:
+    """Gauss-Newton for families linear in their parameters, with fewer matrices if these are large; else L-BFGS."""
+    if not parametrisation.linear:
+        return LBFGS()
+    terms = parametrisation.term_count(problem.n) if isinstance(parametrisation, GradedParametrisation) else 0
+    if terms and problem.n > RULES.many_joints:
+        return QuasiNewton(tolerance=RULES.tolerance_of_many)
+    if terms <= RULES.many_terms:
+        return GaussNewton()
+    return QuasiNewton() if problem.metric.is_identity else QuasiNewton(renewal=RULES.renewal_in_metric)
 
-    def _count_samples(self, family: Family, kept: NDArray[np.bool_] | None) -> int:
-        """Number of samples of a family. A sample of a mirror symmetric problem counts twice."""
-        if not isinstance(family, LinearFamily):
-            return self.settings.samples or RULES.network_samples
-        count = self._count_for_basis(family.width, family.outputs)
-        return count if kept is None or self.settings.samples else ceil(count / 2)
 
-    def _count_for_basis(self, terms: int, r: int) -> int:
-        """Number of samples for a linear family, so that there are 70 to 140 residuals per coefficient."""
-        rows = self.problem.m + r - 1
-        if self.problem.n > RULES.many_joints:
-            return self.settings.samples or ceil(RULES.residuals_of_many * terms / rows)
-        residuals = RULES.residuals if self.problem.metric.is_identity else RULES.residuals_in_metric
-        return self.settings.samples or RULES.least_samples + ceil(residuals * terms / rows)
-
-    def _sample(self, count: int, tag: int) -> Samples:
-        points = sample_evenly(self.problem.domain, count, (self.settings.seed, tag))
-        return evaluate_samples(self.problem, points).restricted_to(self.active)
-
-    def _draw(self, count: int, seed: tuple[int, ...]) -> Samples:
-        fresh = sample_problem(self.problem, count, (self.settings.seed, RULES.fresh_tag, *seed))
-        return fresh.restricted_to(self.active)
-
-    def _gradients(self, family: LinearFamily) -> BasisGradients:
-        """Gradients of a basis, built once."""
-        if family not in self._bases:
-            number = np.float32 if self.settings.single else np.float64
-            self._bases[family] = build_gradients(family, self.space.n, number)
-        return self._bases[family]
+def _check_bound(parametrisation: Parametrisation, max_mutual_deg: float) -> float:
+    if parametrisation.closed_form is not None:
+        raise InvalidValueError("max_mutual_deg", f"given with {parametrisation.label}", "a parametrisation to fit")
+    bound = as_number("max_mutual_deg", max_mutual_deg)
+    if not RULES.least_bound_deg <= bound < 90:
+        expected = f"an angle from {RULES.least_bound_deg:g} to below 90 degrees"
+        raise InvalidValueError("max_mutual_deg", max_mutual_deg, expected)
+    return bound

@@ -82,7 +82,13 @@ def find_spectral_start(
         length = np.sqrt(np.maximum(np.einsum("sn,sn->s", gradient, G @ c), 1e-300))
         along = np.einsum("sn,snk->sk", gradient / length[:, None], G)
         S = S + RULES.mutual_weight * along.T @ along / N
-    return _mix(C, G, allowed).ravel()
+    # coordinates have a mean gradient length of 1. The spectral solution inherits the symmetries of the problem, and a
+    # symmetric point is often a saddle of the loss: neighbours that allow the same coefficients are mixed slightly
+    C = C / np.linalg.norm(G @ C.T, axis=1).mean(axis=0)[:, None]
+    cos, sin = np.cos(RULES.mixing_angle), np.sin(RULES.mixing_angle)
+    for k in np.flatnonzero((allowed[1:] == allowed[:-1]).all(axis=1)):
+        C[k], C[k + 1] = cos * C[k] + sin * C[k + 1], cos * C[k + 1] - sin * C[k]
+    return np.asarray(C.ravel())
 
 
 def _find_smallest(S: Array, T: Array, V: Array, free: NDArray[np.bool_]) -> Array:
@@ -95,18 +101,6 @@ def _find_smallest(S: Array, T: Array, V: Array, free: NDArray[np.bool_]) -> Arr
     c = np.zeros(len(free))
     c[free] = equal @ np.linalg.eigh(equal.T @ V[block] @ equal)[1][:, 0]
     return c
-
-
-def _mix(C: Array, G: Array, allowed: NDArray[np.bool_]) -> Array:
-    """Scale coordinates to a mean gradient length of 1, and mix neighbours slightly that allow the same coefficients.
-
-    The spectral solution inherits the symmetries of the problem, and a symmetric point is often a saddle of the loss.
-    """
-    C = C / np.linalg.norm(G @ C.T, axis=1).mean(axis=0)[:, None]
-    c, s = np.cos(RULES.mixing_angle), np.sin(RULES.mixing_angle)
-    for j in np.flatnonzero((allowed[1:] == allowed[:-1]).all(axis=1)):
-        C[j], C[j + 1] = c * C[j] + s * C[j + 1], c * C[j + 1] - s * C[j]
-    return C
 
 
 @dataclass(frozen=True, eq=False)

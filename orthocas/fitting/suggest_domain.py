@@ -16,7 +16,7 @@ from orthocas.charts.point_quality import worst_points
 from orthocas.errors import DomainError, InvalidValueError, MetricError
 from orthocas.fitting.fit import Fit, fit_from
 from orthocas.fitting.probe import RULES, Bounds, Miss, Prober, Quality, describe_conditioning, evaluate_chart
-from orthocas.fitting.settings import choose_parametrisation
+from orthocas.fitting.stages import choose_parametrisation
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, WeightNumbers, Weights
 from orthocas.robots.robot import Robot
 from orthocas.robots.tree import PRISMATIC_ROOM, REVOLUTE_ROOM, require_driven
@@ -249,14 +249,10 @@ class WidestBox:
         times = [RULES.first_time, *[count + RULES.next_time] * rounds]
         ends = np.cumsum(times) / (sum(times) + RULES.growth_time * count)
         self._next = ends[0], RULES.trials
-        return self._grow(self._exchange_widths(self._scale_to_boundary(unit, RULES.start), ends[1:]))
-
-    def _exchange_widths(self, widths: Array, ends: Array) -> Array:
-        """Half-widths after rounds of exchange, each of which ends at a fraction of the search."""
-        exchange, step = None, 1.0
-        for end in ends:
-            self._next = end, len(self.free) + RULES.trials
-            # wider where joints cost little, narrower where they cost much
+        widths, exchange, step = self._scale_to_boundary(unit, RULES.start), None, 1.0
+        # rounds of exchange: wider where joints cost little, narrower where they cost much
+        for end in ends[1:]:
+            self._next = end, count + RULES.trials
             exchange = self._compute_exchange(widths) if exchange is None else exchange
             trial = self._scale_to_boundary(widths * np.exp(-step * exchange), 1.0)
             if np.log(trial[self.free]).sum() > np.log(widths[self.free]).sum():
@@ -266,7 +262,7 @@ class WidestBox:
             step /= 2
             if step < RULES.least_step:
                 break
-        return widths
+        return self._grow(widths)
 
     def evaluate(self, widths: Array, enough: Bounds | None = None, leap: bool = False) -> Quality:
         """Fit and evaluate on the box of the given half-widths, see `Prober.evaluate`."""

@@ -94,11 +94,6 @@ def coordinates_of(rows: Sequence[Any], exchanged: Pairs) -> list[Any]:
     return turned
 
 
-def require_sample_data(name: str) -> None:
-    """Raise UnknownNameError unless samples have this data."""
-    require_known("data of a sample", name, SAMPLE_DATA)
-
-
 @dataclass(frozen=True)
 class TaskTerm:
     """Mean over task components i and coordinates j of the squared cosines of [AS2023] eq. (24), first sum.
@@ -384,7 +379,7 @@ def register_loss_term(term: LossTerm) -> None:
     if isinstance(term, type) or not isinstance(term, LossTerm):
         raise InvalidValueError("term", f"a {type(term).__name__}", "an object with the members of LossTerm")
     for name in term.data:
-        require_sample_data(name)
+        require_known("data of a sample", name, SAMPLE_DATA)
     if _TERMS.get(term.name, term) != term:
         raise InvalidValueError("name", repr(term.name), "a name that no other term uses")
     _TERMS[term.name] = term
@@ -405,15 +400,15 @@ def find_term(name: str) -> LossTerm:
     return _TERMS[name]
 
 
-_OF_WIDE_FITS = (
+for _term in (
+    *(TaskTerm(), MutualTerm(), MetricTaskTerm(), MetricMutualTerm(), LengthTerm(), RegularityTerm(), FOLD_TERM),
+    # of wide fits
     RegularityTerm("volume", RULES.wide_volume),
     RegularityTerm("volume with the worst", RULES.worst_volume),
     RegularityTerm("euclidean volume", RULES.beyond * RULES.least_in_metric, euclidean=True),
     MetricLengthTerm(),
     SelfMotionTerm(),
-)
-_OURS = (MetricTaskTerm(), MetricMutualTerm(), LengthTerm(), RegularityTerm(), FOLD_TERM)
-for _term in (TaskTerm(), MutualTerm(), *_OURS, *_OF_WIDE_FITS):
+):
     register_loss_term(_term)
 
 WeightNumbers = Sequence[float]  #: two to five numbers: task, mutual, regularity, length, folds

@@ -18,10 +18,10 @@ from orthocas.bases.family import (
     LinearFamily,
     Parametrisation,
     require_parametrisation,
+    warn_unless_savable,
 )
 from orthocas.bases.mlp import MLP
 from orthocas.bases.products import Polynomial
-from orthocas.bases.registry import warn_unless_savable
 from orthocas.charts.chart import Chart
 from orthocas.charts.chart_file import FREE
 from orthocas.charts.coordinates import Coordinates
@@ -94,25 +94,21 @@ def fit_wide(
     similar motion everywhere. Half of the samples are uniform, of networks 70 %, the others boundary-weighted. The
     numbers are those of `orthocas.fitting.wide_search.WideRules`.
 
-    The stages are these:
+    Families are tried until one leaves out little of the branch:
 
-    1. Under a whole pose or orientation, families without the last joint come first. If the first one can turn fully,
-       families without both come before these. Then xi stays while base or tool turn about their own axes: full turns
-       close, and rolling the hand moves no other joint. With r = 1, these are networks,
-       MLP((24, 24, 24), raw=True, activation="isru"): they lean less into the task than polynomials, but have no
-       proof in a useful time. With several coordinates or `like`, they are polynomials, linear in the first joint. A
-       family is kept if it leaves out little of the branch after all rounds of 4. Where the first result leaves out
-       more than a tenth, 3 follows.
-    2. Polynomials that are linear in each joint on whose position self-motions do not depend, such as the first and the
-       last one, descend with L-BFGS from linear coordinates across the task at the centre of the branch. They are best
-       to prove, and hold at any turn of these joints. They ask that self-motions turn base and tool in one direction.
-    3. If these leave out much of the branch, polynomials in all joints are tried, and a network,
-       MLP((64, 64, 64), raw=True, activation="isru"), where both leave out much, or the first ones very much, as on
-       arms whose axes pass each other at a distance. A network begins at random, or with the result of A = I in
-       another metric with r = 1, and descends with Adam on some of the samples at a time. It takes several times as
-       long to evaluate, and is not tried with `like` or with slides without limits.
-    4. The best ones go on: as long as they are not regular enough at other samples, and get better, the worst of many
-       fresh samples join. Once they are, leaks weigh more in a last descent, kept if coordinates stay regular enough.
+    1. Under a whole pose or orientation, those without the last joint, and before them those without the first one too,
+       if it can turn fully. Then xi stays while base or tool turn about their own axes. With r = 1 they are small
+       networks, which lean less into the task than polynomials but have no proof in a useful time; with several
+       coordinates or `like`, polynomials.
+    2. Polynomials linear in each joint on whose position self-motions do not depend, such as the first and the last
+       one. They are best to prove, and hold at any turn of these joints.
+    3. Polynomials in all joints, and a network, as on arms whose axes pass each other at a distance. It takes several
+       times as long to evaluate, and is not tried with `like` or with slides without limits.
+
+    Polynomials descend with L-BFGS from linear coordinates across the task at the centre of the branch; networks with
+    Adam from a random start, or from the result of A = I in another metric with r = 1. The best ones go on: as long as
+    they are not regular enough at other samples, and get better, the worst of many fresh samples join. Once they are,
+    leaks weigh more in a last descent, kept if coordinates stay regular enough.
 
     The best result is kept: regular at the centre, with the fewest bad positions, then with the largest 1 % quantile of
     the volume. The domain of the chart is the part of the branch where coordinates are regular with a margin in the
@@ -348,7 +344,11 @@ def _prepare(problem: Problem, family: Parametrisation, like: Likeness | None) -
     require_parametrisation(family)
     family = family.for_problem(problem)
     if isinstance(family, CyclicParametrisation):
-        problem = widen_over_cyclic_joints(problem, (*family.cyclic, *_find_free_turns(problem, family)))
+        # a family that does without joints that turn tool or base is regular at any turn of them, or at none
+        names, task = problem.robot.joint_names, problem.task
+        left_out = ((name, names.index(name)) for name in list_left_out(family) if name in names)
+        free = (name for name, k in left_out if turns_tool(task, k) or keeps_self_motions(problem, k))
+        problem = widen_over_cyclic_joints(problem, (*family.cyclic, *free))
     if family.closed_form is not None:
         expected = "one that is fitted, such as a polynomial or an MLP, or one without parameters, such as Given"
         raise InvalidValueError("parametrisation", family.label, expected)
@@ -356,13 +356,6 @@ def _prepare(problem: Problem, family: Parametrisation, like: Likeness | None) -
         raise InvalidValueError("parametrisation", family.label, "one that is linear in its parameters, for like")
     warn_unless_savable(family)
     return problem, family
-
-
-def _find_free_turns(problem: Problem, family: Parametrisation) -> tuple[str, ...]:
-    """Joints that turn tool or base and that a family does without: it is regular at any turn of them, or at none."""
-    names = problem.robot.joint_names
-    places = {name: names.index(name) for name in list_left_out(family) if name in names}
-    return tuple(name for name, k in places.items() if turns_tool(problem.task, k) or keeps_self_motions(problem, k))
 
 
 def _solve_at_once(

@@ -12,14 +12,14 @@ from orthocas.bases.mlp import MLP
 from orthocas.charts.coordinates import Coordinates
 from orthocas.errors import InvalidValueError
 from orthocas.fitting.basis_objective import BasisGradients, BasisObjective, build_gradients
+from orthocas.fitting.combined import Resampled, WeightedSum
 from orthocas.fitting.like import Like, QuadraticTerm
 from orthocas.fitting.network_objective import ArrayObjective, GraphObjective
-from orthocas.fitting.stages import Resampled, Stage, WeightedSum
+from orthocas.fitting.stages import Stage
 from orthocas.fitting.terms import RULES as LOSS
 from orthocas.fitting.terms import Weights, find_least_volume
 from orthocas.robots.collisions import Collisions
-from orthocas.solvers.adam import Adam
-from orthocas.solvers.lbfgs import LBFGS
+from orthocas.solvers.minimisers import LBFGS, Adam
 from orthocas.solvers.protocol import Objective, Solver, SolveResult
 from orthocas.tasks.domains import Box
 from orthocas.tasks.problem import Problem
@@ -225,8 +225,11 @@ class Search:
             self._sign = 1.0 if self._evaluate_volumes(self._last, self._centre)[0] > 0 else -1.0
             self._descend(name, "volume", self.solver)
         else:
-            self._samples = [sample_frames(self.problem, np.vstack([points, self._sample_near_centre()]))]
-            problem = self.problem
+            # samples near the centre, whose sign decides which part of the domain is kept
+            problem, domain, count = self.problem, self.problem.domain, max(2, int(RULES.near * self.samples))
+            seed = self.settings.seed, RULES.tag, RULES.centre_tag
+            near = sample_uniform(Box(domain.home, RULES.near * domain.half_width), count, seed)
+            self._samples = [sample_frames(problem, np.vstack([points, near[domain.contains(near)]]))]
             if problem.metric.is_identity or problem.r > 1 or self.left_out:
                 self._last = self._start_at_random()
             else:
@@ -302,13 +305,6 @@ class Search:
             if not len(points):
                 raise InvalidValueError("collisions", "a contact at all samples of the branch", "free postures")
         return points
-
-    def _sample_near_centre(self) -> Array:
-        """Nonsingular samples near the centre of the domain, whose sign decides which part of it is kept."""
-        domain = self.problem.domain
-        near, count = Box(domain.home, RULES.near * domain.half_width), max(2, int(RULES.near * self.samples))
-        points = sample_uniform(near, count, (self.settings.seed, RULES.tag, RULES.centre_tag))
-        return np.asarray(points[domain.contains(points)])
 
     def _start_linear(self) -> Array:
         """The functions nearest to a^T q, with orthonormal a across the task at the centre, (size,).

@@ -98,7 +98,9 @@ def generate_kernels(functions: list[ca.Function], prefix: str) -> Kernels:
     code = re.sub(r"\bcasadi_real\b", "double", re.sub(r"\bcasadi_int\b", "int", code))
     code = re.sub(rf"\b(?:casadi_(?=\w)|(?={'|'.join(names)})(?=\w+\(const double\*\* arg))", f"{prefix}_", code)
     if re.search(r"\bpow\(", code):
-        code = f"{write_power(f'{prefix}_power')}\n\n" + re.sub(r"\bpow\(", f"{prefix}_power(", code)
+        # `pow` is slow on small processors.
+        power = render("algebra.c", {"what": "power", "name": f"{prefix}_power"}).rstrip("\n")
+        code = f"{power}\n\n" + re.sub(r"\bpow\(", f"{prefix}_power(", code)
     work = {f.name(): (f.sz_arg(), f.sz_res(), f.sz_iw(), doubles[f.name()]) for f in functions}
     return Kernels(code, work, {f.name(): f.numel_out(0) for f in functions}, prefix)
 
@@ -199,7 +201,16 @@ def _move_slots(block: str, function: ca.Function, below: int) -> tuple[str, int
     body = _PLACE.sub("", block.split("{", 1)[1])
     if re.search(r"\bw\b", re.sub(rf"{_CALL.pattern}\(arg1, res1, iw, w, 0\)", "", body)):
         return block, function.sz_w()
-    sizes = _measure_slots(function)
+    # How many numbers each slot has; a call may have several outputs, each with a slot of its own.
+    sizes: dict[int, int] = {}
+    for k in range(function.n_instructions() if function.is_a("MXFunction") else 0):
+        node = function.instruction_MX(k)
+        slots = [] if function.instruction_id(k) == ca.OP_OUTPUT else function.instruction_output(k)
+        for index, slot in enumerate(slots):
+            if function.instruction_id(k) == ca.OP_CALL:
+                sizes[slot] = node.which_function().nnz_out(index)
+            else:
+                sizes[slot] = (node.get_output(index) if len(slots) > 1 else node).nnz()
     # Slots must not overlap in CasADi's own layout; then all move by the same shift.
     places = sorted((int(offset), sizes[int(place)]) for place, offset in _PLACE.findall(block))
     for (offset, size), (following, _) in pairwise(places):
@@ -209,21 +220,6 @@ def _move_slots(block: str, function: ca.Function, below: int) -> tuple[str, int
         return block, below
     shift = below - places[0][0]
     return _PLACE.sub(lambda result: f"*w{result[1]}=w+{int(result[2]) + shift}", block), sum(places[-1]) + shift
-
-
-def _measure_slots(function: ca.Function) -> dict[int, int]:
-    """Size of every slot of the work array, in numbers."""
-    result: dict[int, int] = {}
-    for k in range(function.n_instructions() if function.is_a("MXFunction") else 0):
-        # A call may have several outputs, each with a place of its own; places below 0 are not used.
-        node = function.instruction_MX(k)
-        places = [] if function.instruction_id(k) == ca.OP_OUTPUT else function.instruction_output(k)
-        for index, place in enumerate(places):
-            if function.instruction_id(k) == ca.OP_CALL:
-                result[place] = node.which_function().nnz_out(index)
-            else:
-                result[place] = (node.get_output(index) if len(places) > 1 else node).nnz()
-    return {place: size for place, size in result.items() if place >= 0}
 
 
 def _write_body(function: ca.Function, block: str) -> str | None:
@@ -268,11 +264,6 @@ def _silence_warnings(block: str) -> str:
     silenced = "".join(f"\n  (void){name};" for name in unused)
     static = head if head.startswith("static") else f"static {head}"
     return f"{static}{{{silenced}{body}"
-
-
-def write_power(name: str) -> str:
-    """C of a function that stands for `pow`, which is slow on small processors."""
-    return render("algebra.c", {"what": "power", "name": name}).rstrip("\n")
 
 
 def share_calls(functions: list[ca.Function], states: Mapping[str, int]) -> list[ca.Function]:

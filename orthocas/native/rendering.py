@@ -42,18 +42,18 @@ def _environment(package: str) -> Environment:
     )
     environment.filters |= {"numbers": write_numbers, "array": lambda values: f"{{{write_numbers(values)}}}"}
     environment.filters["strings"] = lambda words: f"{{{', '.join(map(_quote, words))}}}"
-    environment.filters["code"] = pass_context(_translate)
+
+    # Python for NumPy as that of the template's library.
+    def translate(context: Context, text: str) -> str:
+        return str(context["library"].translate(text))
+
+    environment.filters["code"] = pass_context(translate)
     return environment
 
 
 def _quote(word: str) -> str:
     """A string of C; a quote in it would end it."""
     return '"' + word.replace('"', "'") + '"'
-
-
-def _translate(context: Context, text: str) -> str:
-    """Python for NumPy as that of the template's library."""
-    return str(context["library"].translate(text))
 
 
 def write_numbers(values: Iterable[Any]) -> str:

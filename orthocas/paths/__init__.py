@@ -2,7 +2,6 @@
 
 from orthocas.paths.chart_along import chart_along, corridor_problem
 from orthocas.paths.follow import follow
-from orthocas.paths.joint_motion import JointMotion, Margins
-from orthocas.paths.recordings import read_joints
+from orthocas.paths.joint_motion import JointMotion, Margins, read_joints
 
 __all__ = ["JointMotion", "Margins", "chart_along", "corridor_problem", "follow", "read_joints"]

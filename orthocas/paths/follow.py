@@ -9,20 +9,18 @@ from typing import Any
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
-from scipy.interpolate import CubicSpline
 
 from orthocas.charts.chart import Chart
-from orthocas.charts.phi import counted_on
-from orthocas.charts.self_motion import Walls, xi_range
+from orthocas.charts.self_motion import counted_on, xi_range
+from orthocas.charts.walls import Walls, require_collisions
 from orthocas.errors import InvalidValueError, PathError, SolveError
 from orthocas.paths.joint_curve import JointCurve, LostCurve, PhiSolver, TimeLaw, compute_fastest_law, list_places
 from orthocas.paths.joint_motion import JointMotion, Margins
 from orthocas.paths.tool_path import RULES, ToolPath, build_spline
-from orthocas.paths.xi_search import XiSearch
+from orthocas.paths.xi_search import Costs, XiChoice, XiSearch, walk
 from orthocas.robots.collisions import Collisions
 from orthocas.robots.tree import require_driven
 from orthocas.tasks.samples import compute_row_scale, sample_uniform
-from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, as_float_array, as_number, as_point, require_kind
 from orthocas.tools.columns import BlockedFunction
@@ -93,9 +91,7 @@ def follow(
     require_driven("following a path", chart.problem.robot.tree)
     # Raises for grown charts.
     chart.function("second_derivative")
-    if collisions is not None:
-        require_kind("collisions", collisions, Collisions)
-        collisions.require_for(chart.problem.robot.tree)
+    require_collisions(collisions, chart.problem.robot.tree)
     start = chart.problem.domain.home if q_start is None else as_point("q_start", q_start, chart.n)
     # limits of all joints, > 0 and finite
     most = chart.problem.robot.velocity_limits if velocity_limits is None else velocity_limits
@@ -271,8 +267,15 @@ class MotionLimits:
         """Raise PathError at the first place (P,) whose joint position (P, n) is lost or outside."""
         finite = np.flatnonzero(np.isfinite(q).all(axis=1))
         kept = finite[self.chart.problem.domain.contains(q[finite])]
-        if len(kept) < len(q):
-            raise self._build_error(path, s, q, int(np.setdiff1d(np.arange(len(q)), kept)[0]))
+        if len(kept) == len(q):
+            return
+        # what is wrong with the first of the others
+        k = int(np.setdiff1d(np.arange(len(q)), kept)[0])
+        if not np.isfinite(q[k]).all():
+            raise self.build_lost_error(path, LostCurve(s[:k], q[:k], float(s[k])))
+        where = path.describe_place(float(s[k]), self.chart.labels)
+        reason = f"it leaves the domain, stopped by {Walls(self.chart.problem).worst(q[k])}"
+        raise PathError(f"the path cannot be followed {where}: {reason}{self._describe_reach(q[max(k - 1, 0)])}")
 
     def check_contacts(self, path: ToolPath, motion: JointMotion) -> None:
         """Raise PathError where a pair may come nearer than the clearance, at time stamps or between them.
@@ -294,15 +297,6 @@ class MotionLimits:
             f"the path cannot be followed {where}: at {instant:.3f} s '{first}' and '{second}' {near}, "
             f"expected a distance above clearance = {self.clearance:g} m at and between all time stamps"
         )
-
-    def _build_error(self, path: ToolPath, s: Array, q: Array, k: int) -> PathError:
-        """What is wrong with the k-th joint position."""
-        last = max(k - 1, 0)
-        if not np.isfinite(q[k]).all():
-            return self.build_lost_error(path, LostCurve(s[:k], q[:k], float(s[k])))
-        where = path.describe_place(float(s[k]), self.chart.labels)
-        reason = f"it leaves the domain, stopped by {Walls(self.chart.problem).worst(q[k])}"
-        return PathError(f"the path cannot be followed {where}: {reason}{self._describe_reach(q[last])}")
 
     def build_lost_error(self, path: ToolPath, end: LostCurve) -> PathError:
         """The error for a path that ends before s = 1."""
@@ -341,175 +335,3 @@ class MotionLimits:
             np.inf if near is None else float(near.distance[k]),
             "" if near is None else f"'{near.pair[k][0]}' and '{near.pair[k][1]}'",
         )
-
-
-@dataclass(frozen=True, eq=False)
-class Costs:
-    """Residuals of joint positions, and their gradients."""
-
-    limits: MotionLimits
-
-    def __call__(self, q: Array) -> tuple[Array, Array]:
-        """Residuals (P, k) and gradients (P, k, n) at joint positions (P, n)."""
-        parts = [self._evaluate_boundaries(q), self._evaluate_task(q)]
-        if self.limits.collisions is not None:
-            values, gradients = self.limits.collisions.measure_nearest(q, RULES.nearest)
-            residuals, slopes = _evaluate_inverse(values - self.limits.clearance, RULES.away, RULES.too_near)
-            parts.append((residuals, slopes[..., None] * gradients))
-        return np.concatenate([part[0] for part in parts], axis=1), np.concatenate([part[1] for part in parts], axis=1)
-
-    def sum_squares(self, q: Array) -> Array:
-        """Sums of squares of the residuals at joint positions (P, n), (P,)."""
-        return np.asarray((self(q)[0] ** 2).sum(axis=1))
-
-    def _evaluate_boundaries(self, q: Array) -> tuple[Array, Array]:
-        domain = self.limits.chart.problem.domain
-        bounded = np.flatnonzero(np.isfinite(domain.bounds[0]))
-        u = ((q - domain.centre) / domain.half_width)[:, bounded]
-        # u / sqrt(1 - u^2) in half-widths, and a straight line where that grows too steep.
-        near = np.clip(u, -RULES.inside, RULES.inside)
-        slopes = (1 - near**2) ** -1.5
-        residuals = near / np.sqrt(1 - near**2) + (u - near) * slopes
-        gradients = np.zeros((len(q), len(bounded), q.shape[1]))
-        gradients[:, np.arange(len(bounded)), bounded] = slopes / domain.half_width[bounded]
-        return residuals, gradients
-
-    def _evaluate_task(self, q: Array) -> tuple[Array, Array]:
-        left, values, right = np.linalg.svd(self.limits.compute_scaled_jacobian(q), full_matrices=False)
-        clear = self.limits.chart.problem.domain.singular_bound
-        bound = 0.0 if clear is None else clear.least_singular_value
-        residuals, slopes = _evaluate_inverse(values[:, -1:] - bound, RULES.regular, RULES.nearly_singular)
-        gradients = self._turning(q, left[:, :, -1] / self.limits.scale, right[:, -1])[0]
-        return residuals, slopes[..., None] * gradients[:, None]
-
-    @cached_property
-    def _turning(self) -> Batched:
-        """q, u, v -> the gradient (n, 1) of u^T J(q) v: with singular vectors, that of the singular value."""
-        chart = self.limits.chart
-        q, v, u = ca.SX.sym("q", chart.n), ca.SX.sym("v", chart.n), ca.SX.sym("u", chart.m)
-        product = ca.dot(u, self.limits.rows(q) @ v)
-        return Batched(dense_function("turning", [q, u, v], [ca.cse(ca.gradient(product, q))]))
-
-
-def _evaluate_inverse(room: Array, scale: float, least: float) -> tuple[Array, Array]:
-    """scale / room and its derivative; a straight line where room is below `least`."""
-    far = np.maximum(room, least)
-    slopes = -scale / far**2
-    return scale / far + (room - far) * slopes, slopes
-
-
-def walk(chart: Chart, costs: Costs, x: Array, q: Array) -> Array:
-    """Joint positions (P, n) near task values x (P, m), from q (n,).
-
-    At every place, steps of least norm towards x, and Gauss-Newton steps within the null space of J_x that lower the
-    costs, as in resolved-rate control with gradient projection.
-    """
-    points = []
-    for target in x:
-        for _ in range(RULES.walk_steps):
-            J = chart.parts.relative.batched_rates(q[None])[0].reshape(chart.m, chart.n)
-            # Towards x the step of least norm, within the null space (n, r) a damped Gauss-Newton step.
-            toward = np.linalg.pinv(J, rcond=1e-3) @ chart.parts.relative.difference(target, chart.x(q))
-            inner = np.linalg.svd(J)[2][chart.m :].T
-            residuals, gradients = (part[0] for part in costs(q[None]))
-            G = gradients @ inner
-            along = -inner @ np.linalg.solve(G.T @ G + RULES.walk_damping * np.eye(chart.r), G.T @ residuals)
-            q = q + _limit_step(toward) + _limit_step(along)
-        points.append(q)
-    return np.array(points)
-
-
-def _limit_step(step: Array) -> Array:
-    return np.asarray(step * min(1.0, RULES.walk_step / max(float(np.abs(step).max()), 1e-300)))
-
-
-@dataclass(frozen=True, eq=False)
-class _State:
-    """Values of the spline, and what follows from them."""
-
-    values: Array  #: (K, r)
-    q: Array  #: (P, n)
-    residuals: Array  #: (P, k)
-    gradients: Array  #: (P, k, n)
-    cost: float
-
-
-class XiChoice:
-    """The problem for one tool path.
-
-    Args:
-        plan: the tool path.
-        costs: of joint positions.
-        solver: solves for them.
-    """
-
-    def __init__(self, path: ToolPath, costs: Costs, solver: PhiSolver) -> None:
-        self.path, self.costs, self.solver, self.chart = path, costs, solver, solver.chart
-        # More pieces of the spline on longer paths.
-        length = np.linalg.norm(path.steps, axis=1).sum()
-        pieces = int(np.clip(np.ceil(RULES.piece_density * length), RULES.fewest_pieces, RULES.most_pieces))
-        self.s = np.linspace(0.0, 1.0, RULES.cost_places * pieces + 1)
-        self.nodes = np.linspace(0.0, 1.0, pieces + 1)
-        # Closed paths have the same value at both ends.
-        unit = np.eye(pieces + 1)
-        if path.closed:
-            unit = np.vstack([unit[:pieces, :pieces], unit[:1, :pieces]])
-        self._unit = unit
-        basis = self._build_spline(unit)
-        self._basis = basis(self.s)
-        # Little motion: the squares of xi' and xi'', as a quadratic form of the values.
-        slopes, bends = basis(self.s, 1), basis(self.s, 2)
-        self._smooth = (RULES.speed_weight * slopes.T @ slopes + RULES.bend_weight * bends.T @ bends) / len(self.s)
-
-    def optimise(self, first: Array) -> ToolPath:
-        """The tool path with chosen coordinates, from joint positions near it at the places `s`, (P, n)."""
-        # The spline through the coordinates of these positions, or through their mean where that has no solution.
-        xi = counted_on(self.chart.xi(first), self.chart.parts.turns[self.chart.m :])
-        values = np.linalg.lstsq(self._basis, xi, rcond=None)[0]
-        means = np.tile(xi.mean(axis=0), (len(values), 1))
-        state = self._evaluate_state(values, first) or self._evaluate_state(means, first)
-        if state is None:
-            return self.path
-        damping = RULES.damping
-        for _ in range(RULES.iterations):
-            hessian, gradient = self._build_model(state)
-            # Levenberg-Marquardt: more damping until a step lowers the cost.
-            better = None
-            while better is None and damping < RULES.most_damping:
-                scaled = hessian + damping * np.diag(np.diag(hessian) + 1e-9)
-                change = -np.linalg.solve(scaled, gradient).reshape(state.values.shape)
-                new = self._evaluate_state(state.values + change, state.q)
-                better = new if new is not None and new.cost < state.cost else None
-                damping *= 8 if better is None else 0.3
-            if better is None:
-                break
-            gain, state = state.cost - better.cost, better
-            if gain < RULES.least_gain * state.cost:
-                break
-        return self.path.replace_xi(self._build_spline(self._unit @ state.values))
-
-    def _build_spline(self, values: Array) -> CubicSpline:
-        return CubicSpline(self.nodes, values, bc_type="periodic" if self.path.closed else "not-a-knot")
-
-    def _evaluate_state(self, values: Array, near: Array) -> _State | None:
-        """The state of values (K, r), with joint positions near others; None where Newton's method fails."""
-        goals = np.hstack([self.path.x(self.s), self._basis @ values])
-        q = self.solver.solve(near, goals)
-        if not np.isfinite(q).all():
-            return None
-        smooth = float(np.einsum("kr,kl,lr->", values, self._smooth, values))
-        residuals, gradients = self.costs(q)
-        return _State(values, q, residuals, gradients, float((residuals**2).sum() / len(q)) + smooth)
-
-    def _build_model(self, state: _State) -> tuple[Array, Array]:
-        """Gauss-Newton Hessian (K r, K r) and half the gradient (K r,) of the cost."""
-        r, m, B = self.chart.r, self.chart.m, self._basis
-        # Gradients with respect to xi: q moves by J^-1 [0; dxi].
-        G = state.gradients @ np.linalg.inv(self.solver.jacobian(state.q))[:, :, m:] / np.sqrt(len(B))
-        squares = np.einsum("pka,pkb->pab", G, G)
-        hessian = np.einsum("pi,pj,pab->iajb", B, B, squares, optimize=True)
-        hessian += np.einsum("ij,ab->iajb", self._smooth, np.eye(r))
-        slope = np.einsum("pi,pka,pk->ia", B, G, state.residuals / np.sqrt(len(B)), optimize=True)
-        slope += self._smooth @ state.values
-        size = B.shape[1] * r
-        return hessian.reshape(size, size), slope.ravel()

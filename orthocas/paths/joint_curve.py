@@ -10,8 +10,8 @@ from scipy.interpolate import BSpline, CubicHermiteSpline
 from scipy.optimize import linprog
 from scipy.sparse import coo_array, vstack
 
-from orthocas.charts.newton import Newton
-from orthocas.charts.phi import largest
+from orthocas.charts.curve_tracer import solutions_of
+from orthocas.charts.newton import Newton, largest
 from orthocas.errors import PathError, SolveError
 from orthocas.paths.tool_path import RULES
 from orthocas.tools.batch import Batched
@@ -51,17 +51,6 @@ class PhiSolver:
         """Solutions q (N, n) of phi(q) = goal near starts (N, n); NaN where Newton's method fails."""
         result = self._newton(goals, starts)
         return np.where((largest(result.residual) < RULES.residual)[:, None], result.q, np.nan)
-
-
-def solve_stack(J: Array, right: Array) -> Array:
-    """J^-1 right for stacks (N, n, n) and (N, n); least squares where J is singular, NaN where it is not finite."""
-    try:
-        return np.asarray(np.linalg.solve(J, right[..., None])[..., 0], dtype=float)
-    except np.linalg.LinAlgError:
-        finite = np.isfinite(J).all(axis=(1, 2))
-        solution = np.full_like(right, np.nan)
-        solution[finite] = (np.linalg.pinv(J[finite]) @ right[finite][..., None])[..., 0]
-        return solution
 
 
 Goal = Callable[..., Array]  #: s, order of the derivative -> phi or its rates, (n,) or (N, n)
@@ -127,15 +116,16 @@ class JointCurve:
             raise PathError(f"the path cannot be followed at s = {s[bad[0]]:.6g}: the chart is nearly singular there")
         # J q' = phi', and J q'' is what of phi'' the bending of phi does not give.
         J = self.solver.jacobian(q)
-        first = solve_stack(J, self.goal(s, 1))
-        return q, first, solve_stack(J, self.goal(s, 2) - self.solver.compute_turning(q, first, first))
+        first = solutions_of(J, self.goal(s, 1)[..., None])[..., 0]
+        bend = self.goal(s, 2) - self.solver.compute_turning(q, first, first)
+        return q, first, solutions_of(J, bend[..., None])[..., 0]
 
 
 def _compute_slope(solver: PhiSolver, q: Array, rate: Array) -> Array:
     """dq/ds (n,) for dphi/ds (n,); NaN where q is not finite."""
     if not np.isfinite(q).all():
         return np.full(len(q), np.nan)
-    return np.asarray(solve_stack(solver.jacobian(q[None]), rate[None])[0])
+    return np.asarray(solutions_of(solver.jacobian(q[None]), rate[None, :, None])[0, :, 0])
 
 
 @dataclass(frozen=True, eq=False)

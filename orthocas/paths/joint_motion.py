@@ -1,24 +1,31 @@
-"""The result of `orthocas.follow`: joint positions, velocities and accelerations on time stamps."""
+"""Motions of joints: the result of `orthocas.follow`, and recordings by name, CSV or MCAP files of rosbag2."""
 
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from orthocas.errors import PathFileError
-from orthocas.tools.checks import Array, as_path, freeze_array
+from orthocas.errors import MissingExtraError, PathFileError
+from orthocas.robots.robot import Robot
+from orthocas.tools.checks import Array, as_path, freeze_array, import_extra, require_kind
 from orthocas.tools.display import Shown, listed
-from orthocas.tools.files import publish, require_replaceable, require_writable
+from orthocas.tools.files import RULES as FILE_RULES
+from orthocas.tools.files import publish, read_table, require_replaceable, require_writable
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _HEAD = "time_s"  # first column of our files
 _CLOSED = 1e-6  # [rad] or [m]; what a closed loop leaves over is rounding
+_MOST = 5_000_000  # instants
+_MAGIC = b"\x89MCAP0\r\n"
+_LATEST = 1e11  # [s]; times may count from 1970
+_TIMES = ("time_s", "__time", "time", "timestamp", "t")
+_JOINT_STATE = ("sensor_msgs/msg/JointState", "sensor_msgs/JointState")
 
 
 @dataclass(frozen=True)
@@ -143,16 +150,13 @@ def require_place(path: Path, force: bool) -> None:
         PathFileError: if the folder is missing or not writable, or there is a file of others, or a symbolic link.
     """
     require_writable(path, PathFileError)
-    require_replaceable(path, _is_ours(path), force, PathFileError)
-
-
-def _is_ours(path: Path) -> bool:
-    """Whether a file begins like those of `save_csv`."""
+    # our own files begin like those of `save_csv`
     try:
         with path.open("rb") as stream:
-            return stream.read(len(_HEAD) + 1) == f"{_HEAD},".encode()
+            ours = stream.read(len(_HEAD) + 1) == f"{_HEAD},".encode()
     except OSError:
-        return False
+        ours = False
+    require_replaceable(path, ours, force, PathFileError)
 
 
 def _draw(axes: Any, times: Array, values: Array, names: Sequence[str], label: str) -> None:
@@ -164,3 +168,90 @@ def _draw(axes: Any, times: Array, values: Array, names: Sequence[str], label: s
     axes.grid(alpha=0.3)
     if names:
         axes.legend(lines, names, fontsize=7, ncols=4, frameon=False, loc="lower left", bbox_to_anchor=(0, 1))
+
+
+def read_joints(path: str | Path, robot: Robot, topic: str | None = None) -> tuple[Array, Array]:
+    """Times and joint positions of a recording, for the joints of a robot in its order.
+
+    - A CSV file has a column of times in seconds, named time_s, __time, time, timestamp or t, and one for each joint:
+      its name, or a path that ends in it or in it and "position", such as PlotJuggler's
+      `/joint_states/panda_joint1/position`.
+    - An MCAP file of rosbag2 has sensor_msgs/JointState messages. Joints may come in several messages: a row is added
+      with each message once all joints are known.
+
+    Args:
+        path: the file.
+        robot: whose joints are read; other columns and joints are left out.
+        topic: of the messages in an MCAP file; default: all topics with JointState messages.
+
+    Returns:
+        Times (N,) from the first one [s], not decreasing, and positions (N, n) [rad] or [m].
+
+    Raises:
+        PathFileError: names the file, and what is wrong there.
+        MissingExtraError: if an MCAP file needs a package that is not installed.
+    """
+    require_kind("robot", robot, Robot)
+    file = as_path("path", path)
+    joints = robot.joint_names
+    try:
+        with file.open("rb") as stream:
+            is_mcap = stream.read(len(_MAGIC)) == _MAGIC
+    except OSError as error:
+        raise PathFileError(f"recording {file}: cannot be read, {error.strerror}") from None
+    # messages of rosbag2, or columns of a table
+    if is_mcap:
+        rows = np.array(list(_read_messages(file, joints, topic))).reshape(-1, robot.n + 1)
+    else:
+        rows = read_table(file, "recording", "instants", _MOST, lambda names: _find_columns(names, joints), 1, _LATEST)
+    if not len(rows):
+        raise PathFileError(f"recording {file}: no JointState messages with all of the joints {', '.join(joints)}")
+    if not (np.abs(rows) <= [_LATEST, *(robot.n * [FILE_RULES.largest])]).all() or (np.diff(rows[:, 0]) < 0).any():
+        raise PathFileError(f"recording {file}: times decrease, or a position is not finite")
+    return freeze_array("times", rows[:, 0] - rows[0, 0], (None,)), freeze_array("q", rows[:, 1:], (None, robot.n))
+
+
+def _find_columns(names: Sequence[str], joints: Sequence[str]) -> list[int]:
+    """The columns of the times and of each joint; raises ValueError if one is missing or not the only one."""
+    times = [names.index(name) for name in _TIMES if name in names]
+    if not times:
+        raise ValueError(f"line 1: a column of times is missing, expected one of {', '.join(_TIMES)}")
+    columns = times[:1]
+    # each joint once; columns are called JOINT, TOPIC/JOINT, or .../JOINT/position, with dots or slashes
+    parts = [name.replace(".", "/").split("/") for name in names]
+    for joint in joints:
+        found = [
+            k
+            for k, (name, path) in enumerate(zip(names, parts, strict=True))
+            if joint in (name, path[-1]) or path[-2:] == [joint, "position"]
+        ]
+        if len(found) != 1:
+            came = "is missing" if not found else "comes twice"
+            raise ValueError(f"line 1: column {joint!r} {came}, expected {joint} or .../{joint}/position once")
+        columns += found
+    return columns
+
+
+def _read_messages(file: Path, joints: Sequence[str], topic: str | None) -> Iterator[list[float]]:
+    """Rows of a time and all joints, from the messages of an MCAP file in the order of their times."""
+    reading: Any = import_extra("mcap.reader", "reading MCAP files", "recordings")
+    decoding: Any = import_extra("mcap_ros2.decoder", "reading MCAP files", "recordings")
+    known: dict[str, float] = {}
+    try:
+        with file.open("rb") as stream:
+            reader = reading.make_reader(stream, decoder_factories=[decoding.DecoderFactory()])
+            topics = None if topic is None else [topic]
+            for schema, _, record, message in reader.iter_decoded_messages(topics=topics):
+                if schema is None or schema.name not in _JOINT_STATE:
+                    continue
+                known |= dict(zip(message.name, map(float, message.position), strict=False))
+                stamp = message.header.stamp.sec + 1e-9 * message.header.stamp.nanosec
+                if all(joint in known for joint in joints):
+                    yield [stamp or 1e-9 * record.log_time, *(known[joint] for joint in joints)]
+    except MissingExtraError:
+        raise
+    except OSError as error:
+        raise PathFileError(f"recording {file}: cannot be read, {error.strerror}") from None
+    except Exception as error:
+        # The libraries raise errors of many kinds for damaged files.
+        raise PathFileError(f"recording {file}: no MCAP file of rosbag2, or damaged: {error}") from None

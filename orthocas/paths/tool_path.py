@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike
 from scipy.interpolate import CubicSpline
 
 from orthocas.charts.chart import Chart
-from orthocas.charts.phi import counted_on
+from orthocas.charts.self_motion import counted_on
 from orthocas.errors import InvalidValueError, PathFileError, ShapeError
 from orthocas.robots.spatial import build_rotations
 from orthocas.tasks.relative import Relative
@@ -90,7 +90,14 @@ def sample_path(name: str, path: Any, size: int, labels: tuple[str, ...]) -> Arr
         InvalidValueError, ShapeError: for anything else. The message names the first bad entry.
     """
     if callable(path):
-        return np.array([_evaluate_function(name, path, s, size) for s in np.linspace(0, 1, RULES.samples)])
+        rows = []
+        for s in np.linspace(0, 1, RULES.samples).tolist():
+            try:
+                value = path(s)
+            except Exception as error:
+                raise InvalidValueError(f"{name}({s:g})", f"{type(error).__name__}: {error}", "a value") from None
+            rows.append(freeze_array(f"{name}({s:g})", value, (size,)))
+        return np.array(rows)
     points = as_float_array(name, path)
     if points.ndim != 2 or points.shape[1] != size:
         raise ShapeError(f"{name} ({', '.join(labels)})", points.shape, (None, size))
@@ -118,9 +125,11 @@ class TaskSpline:
     def __init__(self, relative: Relative, s: Array, points: Array, sizes: Array) -> None:
         self._relative, self._s = relative, s
         rows = points
-        # Orientations as quaternions with signs that leave no jump.
+        # Orientations as quaternions, each nearer to the one before than its opposite is.
         if relative.turned:
-            p = continue_signs(Batched(relative.task.quaternion_function)(points)[0])
+            p = Batched(relative.task.quaternion_function)(points)[0]
+            turns = np.where((p[1:] * p[:-1]).sum(axis=1) < 0, -1.0, 1.0)
+            p = p * np.concatenate([[1.0], np.cumprod(turns)])[:, None]
             rows = np.hstack([points[:, : relative.first], p])
             sizes = np.concatenate([sizes[: relative.first], np.ones(4)])
         away = np.abs(rows[-1] - rows[0])
@@ -162,13 +171,6 @@ class TaskSpline:
         return np.concatenate([rows[order][..., :first], omega @ self._relative.task.turn.order.T], axis=-1)
 
 
-def continue_signs(quaternions: Array) -> Array:
-    """Quaternions (N, 4) with signs such that each is nearer to the one before than its opposite is."""
-    turns = np.where((quaternions[1:] * quaternions[:-1]).sum(axis=1) < 0, -1.0, 1.0)
-    signed: Array = quaternions * np.concatenate([[1.0], np.cumprod(turns)])[:, None]
-    return signed
-
-
 def _multiply_conjugate(a: Array, b: Array) -> Array:
     """The vector part of conj(a) b, (..., 3)."""
     product: Array = a[..., :1] * b[..., 1:] - b[..., :1] * a[..., 1:] - np.cross(a[..., 1:], b[..., 1:])
@@ -195,14 +197,6 @@ def build_spline(s: Array, points: Array, closed: bool) -> CubicSpline:
     if closed:
         points = np.vstack([points[:-1], points[:1]])
     return CubicSpline(s, points, bc_type="periodic" if closed else "not-a-knot")
-
-
-def _evaluate_function(name: str, function: Callable[[float], Any], s: float, size: int) -> Array:
-    try:
-        value = function(float(s))
-    except Exception as error:
-        raise InvalidValueError(f"{name}({s:g})", f"{type(error).__name__}: {error}", "a value") from None
-    return freeze_array(f"{name}({s:g})", value, (size,))
 
 
 @dataclass(frozen=True, eq=False)

@@ -5,7 +5,8 @@
   compares its orientation with a reference.
 - `urdf` and `mjcf` read URDF, SRDF and MJCF files; `pinocchio_model` locks joints of a `pin.Model`, converts it to a
   tree, and builds planar arms.
-- `collisions` measures distances between links and from scenes; `obstacles` has the solids of these.
+- `collisions` measures distances between links and from scenes; `obstacles` has scenes and their solids, `shapes` what
+  these are made of, and `collision_files` the solids of robot files and chart files. `capsules` bounds links for C.
 """
 
 from orthocas.robots.robot import Robot

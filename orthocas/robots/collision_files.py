@@ -1,39 +1,51 @@
-"""Collisions from robot files: <collision> elements of URDF files with pairs of SRDF files or found, and MJCF geoms."""
+"""Collisions from robot files, from chart files, and into these: solids of links, where links are, and pairs to check.
 
+URDF files have <collision> elements, with pairs of SRDF files or found ones; MJCF files have geoms and MuJoCo's pairs.
+"""
+
+import os
 from collections.abc import Callable, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, fields
 from itertools import combinations
 from pathlib import Path
 from typing import Any
+from urllib.parse import unquote
 from xml.etree import ElementTree
 
 import numpy as np
 import pinocchio as pin
 
-from orthocas.errors import RobotError
+from orthocas.errors import InvalidValueError, RobotError
 from orthocas.robots.collisions import Collisions, Pair, Part
-from orthocas.robots.link_shapes import MJCF, LinkPlace, load_mesh, place_links, read_numbers, read_pose
-from orthocas.robots.mjcf import build_pose, compile_mjcf, name_body
+from orthocas.robots.mjcf import build_pose, compile_mjcf, name_body, read_mjcf
+from orthocas.robots.pinocchio_model import find_axis, find_frame, lock_joints, lock_others
 from orthocas.robots.shapes import (
     BallGeometry,
     BoxGeometry,
     CapsuleGeometry,
+    CloudGeometry,
     CylinderGeometry,
     EllipsoidGeometry,
     Geometry,
     HalfSpaceGeometry,
     HullGeometry,
     Shape,
+    read_mesh,
 )
-from orthocas.robots.tree import KinematicTree
-from orthocas.robots.urdf import find_srdf, read_urdf_xml, read_xml
-from orthocas.tools.checks import Array
+from orthocas.robots.spatial import rotate_z_to
+from orthocas.robots.tree import BASE_JOINTS, KinematicTree
+from orthocas.robots.urdf import find_srdf, read_urdf, read_urdf_xml, read_xml
+from orthocas.tools.checks import Array, Indices, require_known
+from orthocas.tools.display import listed
+from orthocas.tools.json import get_part
+
+MJCF = ".xml"  #: how names of MJCF files end
 
 
 @dataclass(frozen=True, slots=True)
-class PairRules:
-    """Numbers by which pairs of links are found."""
+class SolidRules:
+    """Numbers by which solids are read, and pairs of links are found."""
 
     seed: int = 0  #: of the postures
     first: int = 1000  #: postures by which pairs are found that always touch
@@ -41,9 +53,12 @@ class PairRules:
     always: float = 0.95  #: fraction of postures from which on a pair touches by its make
     near: float = 0.02  #: [m]; pairs that never come nearer are left out
     smallest: float = 1e-9  #: size of a shape [m]
+    same_place: float = 1e-6  #: between the joints of two files of one robot [m]
+    largest: float = 1e6  #: [m], of sizes and places in chart files
+    straight: float = 1e-6  #: of R^T R - I of poses there
 
 
-RULES = PairRules()
+RULES = SolidRules()
 _SOLIDS = "solids of the links: robot.with_rods(radius) takes rods in their place"
 
 
@@ -56,30 +71,24 @@ class CollisionSource:
     locked: Mapping[str, float] = field(default_factory=dict)  #: joints that were locked, with their positions
 
     def read(self, tree: KinematicTree) -> Collisions:
-        """The solids on the links of a robot; see `read_collisions`."""
-        return read_collisions(tree, self)
+        """The solids of a robot's links and the pairs to check.
+
+        Boxes, cylinders, spheres and capsules stay what they are; a mesh becomes its convex hull. With an SRDF file
+        that disables pairs, all other pairs of links on different bodies are checked. Without one, pairs are found: all
+        but neighbours, links that touch by their make, and links that never come near each other (`SolidRules`).
+
+        Of an MJCF file, geoms that can collide are the solids, named by their bodies, and pairs are those that MuJoCo's
+        own rules let collide: by contype and conaffinity, without parents and their children, and without what is
+        excluded.
+
+        Raises:
+            RobotError: if a file cannot be read, no link has a shape, or the joints are not those of the robot.
+        """
+        return (_read_geoms if self.urdf.suffix.lower() == MJCF else _read_elements)(tree, self)
 
 
-def read_collisions(tree: KinematicTree, source: CollisionSource) -> Collisions:
-    """The solids of a robot's links and the pairs to check.
-
-    Boxes, cylinders, spheres and capsules stay what they are; a mesh becomes its convex hull. With an SRDF file that
-    disables pairs, all other pairs of links on different bodies are checked. Without one, pairs are found: all but
-    neighbours, links that touch in the middle of the limits or in 95 % of 1,000 seeded postures, and links that never
-    come nearer than 0.02 m in 10,000 postures.
-
-    Of an MJCF file, geoms that can collide are the solids, named by their bodies, and pairs are those that MuJoCo's own
-    rules let collide: by contype and conaffinity, without parents and their children, and without what is excluded.
-
-    Args:
-        tree: the robot.
-        source: the files.
-
-    Raises:
-        RobotError: if a file cannot be read, no link has a shape, or the joints are not those of the robot.
-    """
-    if source.urdf.suffix.lower() == MJCF:
-        return _read_geoms(tree, source)
+def _read_elements(tree: KinematicTree, source: CollisionSource) -> Collisions:
+    """The solids and pairs of a URDF file, with its SRDF file."""
     root = read_urdf_xml(source.urdf)
     links = [link for link in root.findall("link") if link.find("collision") is not None]
     places = place_links(source.urdf, tree, [link.get("name", "") for link in links], source.locked)
@@ -111,7 +120,7 @@ def read_collisions(tree: KinematicTree, source: CollisionSource) -> Collisions:
 
 
 def _read_geoms(tree: KinematicTree, source: CollisionSource) -> Collisions:
-    """The same for an MJCF file."""
+    """The solids and pairs of an MJCF file."""
     if source.srdf is not None:
         raise RobotError(f"{source.srdf} is given with {source.urdf}, expected a URDF file with it: MJCF has own pairs")
     compiled = compile_mjcf(source.urdf)
@@ -279,3 +288,200 @@ def _read_shape(path: Path, element: ElementTree.Element) -> Shape | None:
         case _:
             return None
     return Shape(solid, pose.rotation, pose.translation)
+
+
+@dataclass(frozen=True, eq=False)
+class LinkPlace:
+    """Where a link is: the body that carries it, and its pose in the frame of that body."""
+
+    body: int  #: -1 for the base
+    pose: Any  #: pin.SE3
+
+
+def place_links(
+    path: Path, tree: KinematicTree, names: list[str], locked: Mapping[str, float] | None = None
+) -> list[LinkPlace]:
+    """The places of links of a URDF file, or of bodies of an MJCF file, on a robot that was built from it.
+
+    Joints that the robot does not have are locked as in `Robot.from_urdf`.
+
+    Args:
+        path: the file, of MJCF if its name ends in .xml.
+        tree: the robot.
+        names: of the links or bodies.
+        locked: joints that were locked when the robot was built, with their positions [rad] or [m].
+
+    Raises:
+        RobotError: if the file cannot be read, or its joints are not those of the robot.
+    """
+    whole, mimics = read_mjcf(path, locked) if path.suffix.lower() == MJCF else read_urdf(path)
+    model = lock_joints(whole, locked or {}, mimics)
+    if lost := [name for name in tree.body_joints if name not in (*model.names, *BASE_JOINTS)]:
+        raise RobotError(f"{path} has the joints {listed(list(model.names)[1:])}, expected {listed(lost)} among them")
+    model = lock_others(model, [i for i in range(1, model.njoints) if model.names[i] in tree.body_joints], mimics)
+    # Bodies that the model's joints move; the world is the base.
+    carried = [-1, *(tree.body_joints.index(name) for name in list(model.names)[1:])]
+    lengths = np.array([np.linalg.norm(place.translation) for place in list(model.jointPlacements)[1:]])
+    apart = np.abs(lengths - np.linalg.norm(tree.translations[carried[1:]], axis=1))
+    if apart.max(initial=0.0) > RULES.same_place:
+        joint = model.names[1 + int(np.argmax(apart))]
+        raise RobotError(f"{path} places joint '{joint}' elsewhere, expected the robot file that the chart was made of")
+    # Frames of our tree have the joint's axis as z; Pinocchio's have those of the file.
+    turns = [np.eye(3), *(rotate_z_to(find_axis(model, i)[1]) for i in range(1, model.njoints))]
+    places = []
+    for name in names:
+        frame = model.frames[find_frame(model, name)]
+        turn = pin.SE3(turns[frame.parentJoint].T, np.zeros(3))
+        places.append(LinkPlace(carried[frame.parentJoint], turn * frame.placement))
+    return places
+
+
+def load_mesh(path: Path, shape: ElementTree.Element) -> tuple[Array, Indices]:
+    """Vertices (V, 3) [m] and triangles (F, 3) of the mesh that a URDF file at `path` names, scaled.
+
+    Raises:
+        ValueError: if it cannot be found or read, or has no triangle, or a vertex is not finite.
+    """
+    file = find_mesh(path, shape.get("filename", ""))
+    if file is None:
+        raise ValueError("not found")
+    return read_mesh(file, read_numbers(shape, "scale", 3, (1, 1, 1)))
+
+
+def find_mesh(path: Path, name: str) -> Path | None:
+    """The mesh file that a URDF file names: beside it, absolute, or in a package above it or on ROS_PACKAGE_PATH."""
+    name = unquote(name)
+    scheme, _, rest = name.rpartition("://")
+    folder = path.resolve().parent
+    # Packages lie above the file, or where ROS looks for them.
+    if scheme in ("package", "model"):
+        package, _, inside = rest.partition("/")
+        roots = [*folder.parents, folder, *map(Path, filter(None, os.environ.get("ROS_PACKAGE_PATH", "").split(":")))]
+        places = [root / package / inside for root in roots]
+        places += [root / inside for root in roots if root.name == package]
+    else:
+        places = [folder / (rest if scheme == "file" else name)]
+    return next((place for place in places if place.is_file()), None)
+
+
+def read_pose(element: ElementTree.Element) -> Any:
+    """The pose of a visual or collision element in the frame of its link."""
+    origin = element.find("origin")
+    if origin is None:
+        return pin.SE3.Identity()
+    roll, pitch, yaw = read_numbers(origin, "rpy", 3, (0, 0, 0))
+    return pin.SE3(pin.rpy.rpyToMatrix(roll, pitch, yaw), read_numbers(origin, "xyz", 3, (0, 0, 0)))
+
+
+def read_numbers(element: ElementTree.Element, name: str, count: int, default: tuple[float, ...]) -> Array:
+    """Numbers of an attribute; the default if it is missing or is not that many finite numbers."""
+    try:
+        values = np.array([float(word) for word in element.get(name, "").split()])
+    except ValueError:
+        values = np.empty(0)
+    good = values.shape == (count,) and np.isfinite(values).all() and np.abs(values).max() < 1e6
+    return values if good else np.array(default, dtype=float)
+
+
+# What chart files hold of a collision model: plain data and arrays.
+
+_ARRAYS = ("collisions_poses", "collisions_sizes", "collisions_points")
+
+
+@dataclass(frozen=True, eq=False)
+class KnownSolids:
+    """Solids that are there already, in place of files."""
+
+    collisions: Collisions
+    locked: Mapping[str, float] = field(default_factory=dict)
+
+    def read(self, tree: KinematicTree) -> Collisions:
+        """The same on a robot with the same bodies."""
+        known = self.collisions
+        return Collisions(tree, known.parts, known.pairs, known.missing, known.origin)
+
+
+#: by their words in files: a geometry, how many sizes it has, and how it is made of these and of points
+_KINDS: Mapping[str, tuple[type, int, Callable[[Array, Array], Geometry]]] = {
+    "box": (BoxGeometry, 3, lambda size, _: BoxGeometry(size)),
+    "ball": (BallGeometry, 1, lambda size, _: BallGeometry(float(size[0]))),
+    "cylinder": (CylinderGeometry, 2, lambda size, _: CylinderGeometry(*size.tolist())),
+    "capsule": (CapsuleGeometry, 2, lambda size, _: CapsuleGeometry(*size.tolist())),
+    "ellipsoid": (EllipsoidGeometry, 3, lambda size, _: EllipsoidGeometry(size)),
+    "half-space": (HalfSpaceGeometry, 0, lambda *_: HalfSpaceGeometry()),
+    "hull": (HullGeometry, 0, lambda _, points: HullGeometry.around(points)),
+    "cloud": (CloudGeometry, 1, lambda size, points: CloudGeometry(points, float(size[0]))),
+}
+
+
+def collisions_to_data(collisions: Collisions) -> tuple[dict[str, Any], dict[str, Array]]:
+    """A collision model as plain data and arrays; of solids that a pair needs. Corners have single precision."""
+    # Solids that no pair names are never measured, so files need not carry them.
+    used = {name for pair in collisions.pairs for name in pair}
+    parts, poses, sizes, points = list[dict[str, Any]](), list[Array](), list[float](), list[Array]()
+    for part in collisions.parts:
+        if part.name not in used:
+            continue
+        geometry = part.shape.geometry
+        kind = next(word for word, (own, _, _) in _KINDS.items() if isinstance(geometry, own))
+        # Its fields are sizes, but for the corners of a hull, whose faces follow from them, and the points of a cloud.
+        values = {part.name: getattr(geometry, part.name) for part in fields(geometry)}  # type: ignore[arg-type]
+        corners = values.pop("points", np.zeros((0, 3)))
+        values.pop("faces", None)
+        parts.append({"name": part.name, "body": part.body, "kind": kind, "points": len(corners)})
+        poses.append(np.column_stack([part.shape.rotation, part.shape.translation]))
+        sizes += [float(value) for size in values.values() for value in np.ravel(size)]
+        points.append(corners)
+    # Pairs as numbers of names: several parts of a link share its name.
+    names = list(dict.fromkeys(part["name"] for part in parts))
+    header = {
+        "parts": parts,
+        "pairs": [[names.index(first), names.index(second)] for first, second in collisions.pairs],
+        "missing": list(collisions.missing),
+        "origin": collisions.origin,
+    }
+    # Corners are most of the bytes; a float32 of a metre is off by less than a tenth of a micrometre.
+    corners = np.concatenate([np.zeros((0, 3)), *points]).astype(np.float32)
+    arrays = (np.array(poses).reshape(-1, 3, 4), np.array(sizes, dtype=float), corners)
+    return header, dict(zip(_ARRAYS, arrays, strict=True))
+
+
+def collisions_from_data(tree: KinematicTree, data: Mapping[str, Any], arrays: Mapping[str, Any]) -> Collisions:
+    """The collision model of a robot of plain data and arrays that may be anything.
+
+    Raises:
+        OrthocasError, and the errors that Python and NumPy have for damaged data: if they make no sense.
+    """
+    poses, sizes, points = (np.asarray(get_part(arrays, name, np.ndarray), dtype=float) for name in _ARRAYS)
+    # Nothing is trusted: a file may have been edited.
+    for name, array in zip(_ARRAYS, (poses, sizes, points), strict=True):
+        if not (np.abs(array) <= RULES.largest).all():
+            raise InvalidValueError(name, "numbers that are not finite or too large", f"at most {RULES.largest:g}")
+    if (sizes <= 0).any():
+        raise InvalidValueError("collisions_sizes", float(sizes.min()), "numbers above 0")
+    parts, size, point = list[Part](), 0, 0
+    for description, pose in zip(get_part(data, "parts", list), poses, strict=True):
+        kind = get_part(description, "kind", str)
+        require_known("kind of solid", kind, _KINDS)
+        _, length, build = _KINDS[kind]
+        own = sizes[size : size + length]
+        count = get_part(description, "points", int)
+        corners = points[point : point + count]
+        if count < 0 or len(own) != length or len(corners) != count:
+            raise InvalidValueError("solids", f"fewer numbers than a {kind} has", "as many")
+        size, point = size + len(own), point + count
+        # A scaled or mirrored pose would change distances without a word.
+        R = pose[:, :3]
+        if np.abs(R.T @ R - np.eye(3)).max() > RULES.straight:
+            raise InvalidValueError("collisions_poses", R.tolist(), "rotations")
+        shape = Shape(build(own, corners), R, pose[:, 3])
+        parts.append(Part(get_part(description, "name", str), get_part(description, "body", int), shape))
+    names = list(dict.fromkeys(part.name for part in parts))
+    pairs = []
+    for i, k in get_part(data, "pairs", list):
+        for index in (i, k):
+            if isinstance(index, bool) or not isinstance(index, int) or not 0 <= index < len(names):
+                raise InvalidValueError("pair of solids", repr(index)[:80], f"numbers below {len(names)}")
+        pairs.append((names[i], names[k]))
+    missing = [str(name) for name in get_part(data, "missing", list)]
+    return Collisions(tree, parts, pairs, missing, get_part(data, "origin", str))

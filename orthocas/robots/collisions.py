@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from orthocas.errors import InvalidValueError
 from orthocas.robots.kinematics import build_body_poses
-from orthocas.robots.scene import Scene, Solid
+from orthocas.robots.obstacles import Scene, Solid
 from orthocas.robots.shapes import Shape
 from orthocas.robots.spatial import constant
 from orthocas.robots.tree import KinematicTree

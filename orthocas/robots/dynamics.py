@@ -16,10 +16,7 @@ from orthocas.tools.checks import Array, as_float_array, require_finite
 
 _Z = ca.SX([0, 0, 1])
 #: which of mass, mass times centre, and inertia xx, xy, xz, yy, yz, zz are not 0 after `_regroup`
-_OF_BODY = {
-    "revolute": [1, 2, 4, 5, 6, 8, 9],
-    "prismatic": list(range(10)),
-}
+_OF_BODY = {"revolute": [1, 2, 4, 5, 6, 8, 9], "prismatic": list(range(10))}
 PAYLOAD = 10  #: numbers of a payload
 _FORMS = "a mass, (4,) mass and centre, or (10,) mass, centre and inertia Ixx, Ixy, Ixz, Iyy, Iyz, Izz"
 _MATRIX = [0, 1, 2, 1, 3, 4, 2, 4, 5]  #: places of Ixx, Ixy, Ixz, Iyy, Iyz, Izz in the matrix
@@ -78,11 +75,11 @@ def build_inverse_dynamics(
     q: ca.SX,
     dq: ca.SX,
     ddq: ca.SX,
-    gravity: Array,
     payload: ca.SX | None = None,
     inertials: ca.SX | None = None,
+    gravity: Array | None = None,
 ) -> ca.SX:
-    """tau = M ddq + C dq + g, (n, 1) [N m] or [N], for a gravity acceleration (3,) in the world."""
+    """tau = M ddq + C dq + g, (n, 1) [N m] or [N]; a gravity acceleration (3,) takes the place of that of the tree."""
     joints = _build_transforms(tree, q)
     bodies = _build_bodies(tree, payload, inertials)
     # Mimic joints have the velocities S dq, and S^T of the torques of all joints acts on q.
@@ -91,7 +88,7 @@ def build_inverse_dynamics(
     #: angular velocity, angular acceleration matrix, linear acceleration
     states: dict[int, tuple[ca.SX, ca.SX, ca.SX]] = {}
     accelerations: dict[int, ca.SX] = {}
-    at_rest = (ca.SX(3, 1), ca.SX(3, 3), constant(-gravity))
+    at_rest = (ca.SX(3, 1), ca.SX(3, 3), constant(-(tree.gravity if gravity is None else gravity)))
     for i in tree.order:
         # The parent's motion in the axes of the body, then what the joint adds.
         omega_p, U_p, a_p = states.get(tree.parents[i], at_rest)
@@ -111,7 +108,7 @@ def build_inverse_dynamics(
 
 
 def build_forward_dynamics(
-    tree: KinematicTree, q: ca.SX, dq: ca.SX, tau: ca.SX, gravity: Array, inertials: ca.SX | None = None
+    tree: KinematicTree, q: ca.SX, dq: ca.SX, tau: ca.SX, inertials: ca.SX | None = None
 ) -> ca.SX:
     """ddq = M^-1 (tau - C dq - g), (n, 1), with M = L^T D L, from the tips to the base.
 
@@ -120,7 +117,7 @@ def build_forward_dynamics(
     tips_first = list(reversed(range(tree.n)))
     M = build_mass_matrix(tree, q, inertials=inertials)[tips_first, tips_first]
     D, LT, order = ca.ldl(M, False)
-    force = (tau - build_bias(tree, q, dq, gravity, inertials=inertials))[tips_first]
+    force = (tau - build_bias(tree, q, dq, inertials=inertials))[tips_first]
     return ca.ldl_solve(force, D, LT, order)[tips_first]
 
 
@@ -128,12 +125,17 @@ def build_bias(
     tree: KinematicTree,
     q: ca.SX,
     dq: ca.SX,
-    gravity: Array,
     payload: ca.SX | None = None,
     inertials: ca.SX | None = None,
+    gravity: Array | None = None,
 ) -> ca.SX:
     """C(q, dq) dq + g(q), (n, 1)."""
-    return build_inverse_dynamics(tree, q, dq, ca.SX(tree.n, 1), gravity, payload, inertials)
+    return build_inverse_dynamics(tree, q, dq, ca.SX(tree.n, 1), payload, inertials, gravity)
+
+
+def build_gravity(tree: KinematicTree, q: ca.SX, payload: ca.SX | None = None) -> ca.SX:
+    """g(q), (n, 1): the bias at rest."""
+    return build_bias(tree, q, ca.SX(tree.n, 1), payload)
 
 
 def build_zero_momentum(tree: KinematicTree, q: ca.SX) -> ca.SX:
@@ -153,7 +155,8 @@ def build_coriolis_product(tree: KinematicTree, q: ca.SX, v: ca.SX, w: ca.SX, pa
     C(q, v) w = (c(v + w) - c(v - w)) / 4 with c(v) = C(q, v) v. It is bilinear and symmetric in (v, w).
     """
     weightless = np.zeros(3)
-    return (build_bias(tree, q, v + w, weightless, payload) - build_bias(tree, q, v - w, weightless, payload)) / 4
+    plus, minus = (build_bias(tree, q, dq, payload, gravity=weightless) for dq in (v + w, v - w))
+    return (plus - minus) / 4
 
 
 @dataclass
@@ -246,23 +249,17 @@ def find_first_moments(tree: KinematicTree) -> tuple[list[int], tuple[int, ...]]
     return places, tuple(joints)
 
 
-def _unpack_inertials(tree: KinematicTree, inertials: ca.SX) -> list[_Body]:
-    """Bodies with the numbers of `collect_inertials`."""
-    bodies, start = [], 0
-    for kind in tree.body_kinds:
-        ten = ca.SX(10, 1)
-        for place in _OF_BODY[kind]:
-            ten[place], start = inertials[start], start + 1
-        bodies.append(_Body(ten[0], ten[1:4], ca.reshape(ten[[4, 5, 6, 5, 7, 8, 6, 8, 9]], 3, 3)))
-    return bodies
-
-
 def _build_bodies(tree: KinematicTree, payload: ca.SX | None, inertials: ca.SX | None) -> list[_Body]:
-    """The regrouped bodies, with the payload on the one that carries the tip."""
+    """The regrouped bodies, of the tree or with the numbers of `collect_inertials`; a payload is on that of the tip."""
     if inertials is None:
         bodies = [_Body(ca.SX(b.mass), constant(b.moment), constant(b.inertia)) for b in _regroup(tree)]
     else:
-        bodies = _unpack_inertials(tree, inertials)
+        bodies, start = [], 0
+        for kind in tree.body_kinds:
+            ten = ca.SX(10, 1)
+            for place in _OF_BODY[kind]:
+                ten[place], start = inertials[start], start + 1
+            bodies.append(_Body(ten[0], ten[1:4], ca.reshape(ten[[4, 5, 6, 5, 7, 8, 6, 8, 9]], 3, 3)))
     if payload is not None and tree.tip_parent >= 0:
         # Mass, mass times centre, and inertia about the body's origin, in the frame of the tip's body.
         body, R, p, mass = (

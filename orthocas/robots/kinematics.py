@@ -29,12 +29,7 @@ from orthocas.tools.checks import Array, as_float_array, freeze_array, require_f
 _AXES = ("x", "y", "z")
 _LEAST_SQUARE = 1e-24  #: of a cosine
 #: whether the position comes first, and whether the whole orientation counts
-_KINDS = {
-    "orientation": (False, True),
-    "pose": (True, True),
-    "axis": (False, False),
-    "position+axis": (True, False),
-}
+_KINDS = {"orientation": (False, True), "pose": (True, True), "axis": (False, False), "position+axis": (True, False)}
 
 Pose = tuple[ca.SX, ca.SX]  #: rotation (3, 3) and position (3, 1) [m] in the world
 

@@ -45,7 +45,23 @@ def read_mjcf(source: Any, locked: Mapping[str, float] | None = None) -> tuple[p
         compiled, name = source, "the model"
     else:
         compiled, name = compile_mjcf(source), str(as_path("path", source))
-    return _convert(mujoco, compiled, name), _find_mimics(mujoco, compiled, locked or {})
+    _refuse_unread(compiled, name)
+    model = pin.Model()
+    off = bool(compiled.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY)
+    model.gravity.linear = np.zeros(3) if off else compiled.opt.gravity
+    # Of each body: the joint that moves it, and its pose in the joint's frame.
+    carriers = [(0, pin.SE3.Identity())]
+    for i in range(1, compiled.nbody):
+        carriers.append(_add_body(mujoco, model, compiled, i, *carriers[compiled.body_parentid[i]]))
+    for i in range(compiled.nsite):
+        if compiled.site(i).name:
+            joint, placement = carriers[compiled.site_bodyid[i]]
+            there = placement * build_pose(compiled.site_pos[i], compiled.site_quat[i])
+            model.addFrame(pin.Frame(compiled.site(i).name, joint, there, pin.FrameType.OP_FRAME))
+    for i in range(compiled.nkey):
+        if compiled.key(i).name:
+            model.referenceConfigurations[compiled.key(i).name] = compiled.key_qpos[i]
+    return model, _find_mimics(mujoco, compiled, locked or {})
 
 
 def compile_mjcf(path: Any) -> Any:
@@ -65,26 +81,6 @@ def compile_mjcf(path: Any) -> Any:
         return mujoco.MjModel.from_xml_path(str(source))
     except ValueError as error:
         raise RobotError(f"MuJoCo refuses {source}: {one_line(str(error))}") from None
-
-
-def _convert(mujoco: Any, compiled: Any, name: str) -> pin.Model:
-    _refuse_unread(compiled, name)
-    model = pin.Model()
-    off = bool(compiled.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY)
-    model.gravity.linear = np.zeros(3) if off else compiled.opt.gravity
-    # Of each body: the joint that moves it, and its pose in the joint's frame.
-    carriers = [(0, pin.SE3.Identity())]
-    for i in range(1, compiled.nbody):
-        carriers.append(_add_body(mujoco, model, compiled, i, *carriers[compiled.body_parentid[i]]))
-    for i in range(compiled.nsite):
-        if compiled.site(i).name:
-            joint, placement = carriers[compiled.site_bodyid[i]]
-            there = placement * build_pose(compiled.site_pos[i], compiled.site_quat[i])
-            model.addFrame(pin.Frame(compiled.site(i).name, joint, there, pin.FrameType.OP_FRAME))
-    for i in range(compiled.nkey):
-        if compiled.key(i).name:
-            model.referenceConfigurations[compiled.key(i).name] = compiled.key_qpos[i]
-    return model
 
 
 def _find_mimics(mujoco: Any, compiled: Any, locked: Mapping[str, float]) -> dict[str, Mimic]:
@@ -116,7 +112,7 @@ def _refuse_unread(compiled: Any, name: str) -> None:
     if compiled.nbody - 1 > RULES.links:
         raise RobotError(f"{name} has more than {RULES.links} bodies")
     # Numbers and names must be finite and readable.
-    placed = (
+    placed = [
         "body_pos",
         "body_quat",
         "body_ipos",
@@ -126,7 +122,7 @@ def _refuse_unread(compiled: Any, name: str) -> None:
         "jnt_axis",
         "jnt_range",
         "qpos0",
-    )
+    ]
     try:
         compiled.names.decode()
     except UnicodeDecodeError:
@@ -192,31 +188,21 @@ def _find_effort(mujoco: Any, compiled: Any, k: int) -> float:
     """The largest force [N] or torque [N m] of both signs at joint k; inf if an actuator has no limit, or none acts."""
     limit = _reach(compiled.jnt_actfrcrange[k]) if compiled.jnt_actfrclimited[k] else np.inf
     at_joint = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
-    # Motors behind tendons and sites have no torque of one joint alone.
-    acting = [
-        i for i in range(compiled.nu) if compiled.actuator_trntype[i] in at_joint and compiled.actuator_trnid[i, 0] == k
-    ]
-    forces = [
-        abs(compiled.actuator_gear[i, 0]) * _find_force(mujoco, compiled, i)
-        for i in acting
-        if compiled.actuator_gear[i, 0]
-    ]
+    plain = (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtDyn.mjDYN_NONE)
+    total = 0.0
+    for i in range(compiled.nu):
+        gear = abs(compiled.actuator_gear[i, 0])
+        # Motors behind tendons and sites have no torque of one joint alone.
+        if compiled.actuator_trntype[i] not in at_joint or compiled.actuator_trnid[i, 0] != k or not gear:
+            continue
+        force = _reach(compiled.actuator_forcerange[i]) if compiled.actuator_forcelimited[i] else np.inf
+        # Of a motor, the force is the gain times the control.
+        kind = compiled.actuator_gaintype[i], compiled.actuator_biastype[i], compiled.actuator_dyntype[i]
+        if kind == plain and compiled.actuator_ctrllimited[i]:
+            force = min(force, abs(compiled.actuator_gainprm[i, 0]) * _reach(compiled.actuator_ctrlrange[i]))
+        total += float(gear * force)
     # Motors of one joint add up, within the joint's own limit.
-    return min(limit, sum(forces)) if forces and sum(forces) > 0 else limit
-
-
-def _find_force(mujoco: Any, compiled: Any, i: int) -> float:
-    """The largest force of actuator i, before its gear; inf without a limit."""
-    force = _reach(compiled.actuator_forcerange[i]) if compiled.actuator_forcelimited[i] else np.inf
-    # Of a motor, the force is the gain times the control.
-    motor = (
-        compiled.actuator_gaintype[i] == mujoco.mjtGain.mjGAIN_FIXED
-        and compiled.actuator_biastype[i] == mujoco.mjtBias.mjBIAS_NONE
-        and compiled.actuator_dyntype[i] == mujoco.mjtDyn.mjDYN_NONE
-    )
-    if motor and compiled.actuator_ctrllimited[i]:
-        force = min(force, abs(compiled.actuator_gainprm[i, 0]) * _reach(compiled.actuator_ctrlrange[i]))
-    return float(force)
+    return min(limit, total) if total > 0 else limit
 
 
 def _reach(ends: Array) -> float:

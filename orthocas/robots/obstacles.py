@@ -1,16 +1,17 @@
-"""Obstacles: the solids of scenes, and of what a link carries."""
+"""Scenes of named solids around a robot; obstacles are the solids, also of what a link carries."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from os import PathLike
-from typing import Any
+from types import MappingProxyType
+from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 from numpy.typing import ArrayLike
 
 from orthocas.errors import InvalidValueError, RobotError, one_line
-from orthocas.robots.link_shapes import read_mesh
 from orthocas.robots.shapes import (
     BallGeometry,
     BoxGeometry,
@@ -19,9 +20,11 @@ from orthocas.robots.shapes import (
     HalfSpaceGeometry,
     HullGeometry,
     Shape,
+    read_mesh,
 )
 from orthocas.robots.spatial import rotate_z_to, rotation_matrix
-from orthocas.tools.checks import Array, as_number, as_path, freeze_array
+from orthocas.tools.checks import Array, as_number, as_path, freeze_array, require_kind, require_text
+from orthocas.tools.display import Shown, listed
 
 __all__ = ["Box", "Capsule", "Mesh", "Plane", "PointCloud", "Sphere"]
 
@@ -43,6 +46,58 @@ def __getattr__(name: str) -> Any:
         now = "robot.with_rods(radius).collisions.with_scene(oc.Scene({name: solid})) has these distances"
         raise AttributeError(f"orthocas.obstacles has no {name}: {now}")
     raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+
+
+@runtime_checkable
+class Solid(Protocol):
+    """A solid in the world, or in the frame of what carries it."""
+
+    @property
+    def heading(self) -> str:
+        """The solid in a few words."""
+        ...
+
+    @property
+    def shape(self) -> Shape:
+        """The solid for collision checks."""
+        ...
+
+
+class Scene(Shown):
+    """Solids around a robot, by name, in the frame of the world; see `Collisions.with_scene`.
+
+    Args:
+        solids: of `orthocas.obstacles`: boxes, spheres, capsules, planes, meshes and point clouds.
+
+    Example:
+        >>> import orthocas as oc
+        >>> table = oc.obstacles.Box([0.6, 1.0, 0.02], [0.5, 0.0, 0.2])
+        >>> scene = oc.Scene({"table": table, "post": oc.obstacles.Capsule([0.4, 0.3, 0.2], [0.4, 0.3, 0.9], 0.03)})
+        >>> scene.names
+        ('table', 'post')
+    """
+
+    def __init__(self, solids: Mapping[str, Solid]) -> None:
+        require_kind("solids", solids, Mapping)
+        for name, solid in solids.items():
+            require_text("name of a solid", name)
+            if isinstance(solid, type) or not isinstance(solid, Solid):
+                raise InvalidValueError(f"solid '{name}'", f"a {type(solid).__name__}", "one of orthocas.obstacles")
+        self.solids = MappingProxyType(dict(solids))
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        return Scene, (dict(self.solids),)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the solids."""
+        return tuple(self.solids)
+
+    def facts(self) -> dict[str, str]:
+        """The solids."""
+        return {"scene": f"{len(self.solids)} solids: {listed(self.solids)}"} | {
+            name: solid.heading for name, solid in self.solids.items()
+        }
 
 
 @dataclass(frozen=True, eq=False)
@@ -201,7 +256,7 @@ class Mesh:
         scale: float = 1.0,
     ) -> None:
         factor = _check_size("scale", scale)
-        # PathLike): | corners of a file, or those given
+        # corners of a file, or those given
         if isinstance(points, str | PathLike):
             path = as_path("points", points)
             if not path.is_file():

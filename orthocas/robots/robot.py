@@ -16,8 +16,7 @@ from numpy.typing import ArrayLike
 from orthocas.errors import InvalidValueError, RobotError, ShapeError
 from orthocas.robots import dynamics, kinematics
 from orthocas.robots.capsules import build_rods
-from orthocas.robots.collision_data import KnownSolids
-from orthocas.robots.collision_files import CollisionSource
+from orthocas.robots.collision_files import CollisionSource, KnownSolids
 from orthocas.robots.collisions import Collisions
 from orthocas.robots.dynamics import PAYLOAD, add_payload
 from orthocas.robots.kinematics import add_tool
@@ -34,7 +33,7 @@ from orthocas.robots.pinocchio_model import (
     lock_off_chain,
     read_model_postures,
 )
-from orthocas.robots.tree import KinematicTree
+from orthocas.robots.tree import KinematicTree, set_gravity
 from orthocas.robots.urdf import find_robot_file, list_robot_files, read_srdf_postures, read_urdf
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import BuiltOnUse, cached_property
@@ -174,10 +173,10 @@ class Robot(Shown):
         # A bare name such as panda is meant for from_name.
         if not file.suffix and not file.exists() and file.name in list_robot_files():
             raise RobotError(f"cannot read URDF file {file}: no such file; Robot.from_name('{file}') knows this name")
-        robot = cls._from_chain(*read_urdf(file), names, locked, tool, base, gravity)
+        tree, _ = _build_chain(*read_urdf(file), names, locked, tool, base, gravity)
         # Solids are read when they are asked for: meshes take longer than all else.
         source = CollisionSource(file.absolute(), None, dict(locked or {}))
-        return cls(robot.tree, read_srdf_postures(file, robot.joint_names), source)
+        return cls(tree, read_srdf_postures(file, tree.joint_names), source)
 
     @classmethod
     def from_mjcf(
@@ -195,37 +194,12 @@ class Robot(Shown):
 
         Needs the extra `orthocas[mujoco]`, because MuJoCo's compiler reads the file.
         """
-        robot = cls._from_chain(*read_mjcf(path, locked), _check_tips(tip, tips), locked, tool, base, gravity)
+        tree, model = _build_chain(*read_mjcf(path, locked), _check_tips(tip, tips), locked, tool, base, gravity)
+        homes = read_model_postures(model, tree.joint_names)
         # A compiled model has no file to read solids from later.
         if not isinstance(path, str | PathLike):
-            return robot
-        source = CollisionSource(as_path("path", path).absolute(), None, dict(locked or {}))
-        return cls(robot.tree, robot.homes, source)
-
-    @classmethod
-    def _from_chain(
-        cls,
-        model: pin.Model,
-        mimics: Mimics,
-        tips: tuple[str, ...],
-        locked: Locked,
-        tool: Tool,
-        base: str | None,
-        gravity: Gravity,
-    ) -> Self:
-        """The robot of the joints that move the tips, without those that the user locks."""
-        tips = tips or (find_default_tip(model),)
-        # First what the user locks and a base that floats in the file, then all that moves no tip.
-        model = lock_joints(model, locked or {}, mimics)
-        if (floating := find_floating_base(model, tips)) and base is None:
-            joint = floating[0]
-            _log.warning("the base floats in the file (joint '%s') and is held: base='floating' lets it move", joint)
-        model = lock_joints(model, dict.fromkeys(floating, 0.0))
-        chain = lock_off_chain(model, *tips, mimics=mimics)
-        tree = build_tree(chain, *tips, base=base, mimics=mimics)
-        robot = cls(tree, read_model_postures(chain, tree.joint_names))
-        robot = robot if gravity is None else robot.with_gravity(gravity)
-        return robot if tool is None else robot.with_tool(tool)
+            return cls(tree, homes)
+        return cls(tree, homes, CollisionSource(as_path("path", path).absolute(), None, dict(locked or {})))
 
     @classmethod
     def from_model(
@@ -256,9 +230,8 @@ class Robot(Shown):
         names = _check_tips(tip, tips) or (find_default_tip(model),)
         for name in names:
             find_frame(model, name)
-        tree = build_tree(lock_joints(model, locked or {}), *names, base=base)
-        robot = cls(tree, read_model_postures(model, tree.joint_names))
-        return robot if gravity is None else robot.with_gravity(gravity)
+        tree = set_gravity(build_tree(lock_joints(model, locked or {}), *names, base=base), gravity)
+        return cls(tree, read_model_postures(model, tree.joint_names))
 
     @classmethod
     def planar(cls, lengths: Sequence[float], masses: Sequence[float]) -> Self:
@@ -321,10 +294,7 @@ class Robot(Shown):
             >>> robot.with_gravity([0.0, -1.62, 0.0]).gravity([0.0]).round(9).tolist()
             [4.86]
         """
-        vector = freeze_array("gravity", gravity, (3,))
-        if self.tree.floating and vector.any():
-            raise RobotError(f"gravity is {vector.tolist()}, expected none: a base that nothing holds has no gravity")
-        return type(self)(replace(self.tree, gravity=vector), self.homes, self.solids)
+        return type(self)(set_gravity(self.tree, gravity), self.homes, self.solids)
 
     def with_solids(self, urdf: str | PathLike[str], srdf: str | PathLike[str] | None = None) -> Self:
         """The same robot with the solids of another file, such as a robot of a chart file, for `collisions`.
@@ -642,6 +612,28 @@ class Robot(Shown):
         return result[0] if all(single for _, single in sets) else result
 
 
+def _build_chain(
+    model: pin.Model,
+    mimics: Mimics,
+    tips: tuple[str, ...],
+    locked: Locked,
+    tool: Tool,
+    base: str | None,
+    gravity: Gravity,
+) -> tuple[KinematicTree, pin.Model]:
+    """The joints that move the tips, without those that the user locks, as a tree and as a model."""
+    tips = tips or (find_default_tip(model),)
+    # First what the user locks and a base that floats in the file, then all that moves no tip.
+    model = lock_joints(model, locked or {}, mimics)
+    if (floating := find_floating_base(model, tips)) and base is None:
+        joint = floating[0]
+        _log.warning("the base floats in the file (joint '%s') and is held: base='floating' lets it move", joint)
+    model = lock_joints(model, dict.fromkeys(floating, 0.0))
+    chain = lock_off_chain(model, *tips, mimics=mimics)
+    tree = set_gravity(build_tree(chain, *tips, base=base, mimics=mimics), gravity)
+    return tree if tool is None else add_tool(tree, tool), chain
+
+
 def _check_tips(tip: str | None, tips: Sequence[str]) -> tuple[str, ...]:
     """The names of the tips; none where the default is wanted.
 
@@ -659,7 +651,7 @@ def _check_tips(tip: str | None, tips: Sequence[str]) -> tuple[str, ...]:
 #: arguments and expressions
 _FUNCTIONS: dict[str, tuple[tuple[str, ...], Callable[..., ca.SX]]] = {
     "mass_matrix": (("q",), dynamics.build_mass_matrix),
-    "gravity": (("q",), lambda tree, q: dynamics.build_bias(tree, q, ca.SX(tree.n, 1), tree.gravity)),
+    "gravity": (("q",), dynamics.build_gravity),
     "frame_position": (("q",), lambda tree, q, *frames: kinematics.build_frame_pose(tree, q, *frames)[1]),
     "frame_rotation": (("q",), lambda tree, q, *frames: kinematics.build_frame_pose(tree, q, *frames)[0]),
     "frame_jacobian": (("q",), kinematics.build_frame_jacobian),
@@ -668,28 +660,14 @@ _FUNCTIONS: dict[str, tuple[tuple[str, ...], Callable[..., ca.SX]]] = {
     "tip_rotation": (("q",), lambda tree, q: kinematics.build_tip_pose(tree, q)[0]),
     "tip_jacobian": (("q",), kinematics.build_tip_jacobian),
     "joint_points": (("q",), kinematics.build_joint_points),
-    "bias": (("q", "dq"), lambda tree, q, dq: dynamics.build_bias(tree, q, dq, tree.gravity)),
-    "inverse_dynamics": (
-        ("q", "dq", "ddq"),
-        lambda tree, q, dq, ddq: dynamics.build_inverse_dynamics(tree, q, dq, ddq, tree.gravity),
-    ),
-    "forward_dynamics": (
-        ("q", "dq", "tau"),
-        lambda tree, q, dq, tau: dynamics.build_forward_dynamics(tree, q, dq, tau, tree.gravity),
-    ),
+    "bias": (("q", "dq"), dynamics.build_bias),
+    "inverse_dynamics": (("q", "dq", "ddq"), dynamics.build_inverse_dynamics),
+    "forward_dynamics": (("q", "dq", "tau"), dynamics.build_forward_dynamics),
     "coriolis_product": (("q", "v", "w"), dynamics.build_coriolis_product),
     "zero_momentum": (("q",), dynamics.build_zero_momentum),
-    "mass_matrix_with_payload": (("q", "payload"), dynamics.build_mass_matrix),
-    "gravity_with_payload": (
-        ("q", "payload"),
-        lambda tree, q, payload: dynamics.build_bias(tree, q, ca.SX(tree.n, 1), tree.gravity, payload),
-    ),
-    "bias_with_payload": (
-        ("q", "dq", "payload"),
-        lambda tree, q, dq, payload: dynamics.build_bias(tree, q, dq, tree.gravity, payload),
-    ),
-    "coriolis_product_with_payload": (("q", "v", "w", "payload"), dynamics.build_coriolis_product),
 }
+for _name in ("mass_matrix", "gravity", "bias", "coriolis_product"):
+    _FUNCTIONS[f"{_name}_with_payload"] = (*_FUNCTIONS[_name][0], "payload"), _FUNCTIONS[_name][1]
 _MATRICES = (
     "mass_matrix",
     "zero_momentum",

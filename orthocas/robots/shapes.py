@@ -1,6 +1,7 @@
 """Solids in the frame of a body or of the world: boxes, cylinders, rounded hulls, half-spaces and point clouds."""
 
 from dataclasses import dataclass, replace
+from pathlib import Path
 from typing import Any, Protocol, Self
 
 import coal
@@ -8,7 +9,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
-from orthocas.tools.checks import Array, Flags
+from orthocas.tools.checks import Array, Flags, Indices
 
 
 @dataclass(frozen=True, slots=True)
@@ -172,7 +173,10 @@ class HullGeometry(Geometry):
         _, owners, counts = np.unique(hull.equations, axis=0, return_inverse=True, return_counts=True)
         for face in np.flatnonzero(counts > RULES.fan):
             own = owners.ravel() == face
-            ring = _order_around(corners, np.unique(faces[own]), hull.equations[own][0, :3])
+            # Its corners in their order along the edge of the face, in the plane of which it lies.
+            ring, normal = np.unique(faces[own]), hull.equations[own][0, :3]
+            u, v = ((corners[ring] - corners[ring].mean(axis=0)) @ scipy.linalg.null_space(normal[None])).T
+            ring = ring[np.argsort(np.arctan2(v, u))]
             faces = np.concatenate([faces[~own], _halve(ring)])
             owners = np.concatenate([owners.ravel()[~own], np.full(len(ring) - 2, face)])
         return cls(corners, faces)
@@ -197,13 +201,6 @@ class HullGeometry(Geometry):
         offsets = np.einsum("fi,fi->f", normals, corners[:, 0])
         outwards = np.sign(offsets - normals @ self.points.mean(axis=0))
         return np.asarray((outwards * (points @ normals.T - offsets) <= 0).all(axis=1))
-
-
-def _order_around(points: Array, ring: NDArray[np.intp], normal: Array) -> NDArray[np.intp]:
-    """The corners of a plane convex polygon, (K,) places among points, in their order along its edge."""
-    across = scipy.linalg.null_space(normal[None])
-    u, v = ((points[ring] - points[ring].mean(axis=0)) @ across).T
-    return ring[np.argsort(np.arctan2(v, u))]
 
 
 def _halve(ring: NDArray[np.intp]) -> NDArray[np.intp]:
@@ -323,3 +320,21 @@ class Shape:
                 best = volume, middle + low * axis, middle + high * axis, reach
         assert best is not None
         return best[1], best[2], best[3] * (1 + 1e-12)
+
+
+def read_mesh(file: Path, scale: Array) -> tuple[Array, Indices]:
+    """Vertices (V, 3) [m] and triangles (F, 3) of a mesh file, scaled.
+
+    Raises:
+        ValueError: if it cannot be read, has no triangle, or a vertex is not finite.
+    """
+    try:
+        mesh: Any = coal.MeshLoader().load(str(file), scale)
+    except RuntimeError as error:
+        raise ValueError(str(error)) from None
+    # coal's arrays belong to the mesh, and end with it.
+    vertices = np.array(mesh.vertices(), dtype=float).reshape(-1, 3)
+    faces = np.array([[t[0], t[1], t[2]] for t in map(mesh.tri_indices, range(mesh.num_tris))], dtype=np.intp)
+    if not (len(faces) and np.isfinite(vertices).all()):
+        raise ValueError("empty")
+    return vertices, faces

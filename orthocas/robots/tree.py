@@ -6,6 +6,7 @@ from typing import Any, Literal
 
 import casadi as ca
 import numpy as np
+from numpy.typing import ArrayLike
 
 from orthocas.errors import InvalidValueError, RobotError
 from orthocas.tools.checks import Array, as_float_array, freeze_array, require_known, require_shape, require_text
@@ -126,7 +127,13 @@ class KinematicTree:
             require_shape(name, limits.shape, (n,))
             limits.setflags(write=False)
             object.__setattr__(self, name, limits)
-        self._check_mimics()
+        # Each mimic joint follows one of the n joints.
+        for name in ("mimic_kinds", "mimic_leaders"):
+            require_shape(name, (len(getattr(self, name)),), (bodies - n,))
+        for j, leader in enumerate(self.mimic_leaders):
+            _require_index(f"mimic_leaders[{j}]", leader, n - 1, least=0)
+            if self.mimic_factors[j] == 0:
+                raise InvalidValueError(f"mimic_factors[{j}]", 0, "a factor other than 0")
         self._check_joints()
         self._check_frames()
 
@@ -156,16 +163,6 @@ class KinematicTree:
             for what, limit in (("effort", self.effort_limits[i]), ("velocity", self.velocity_limits[i])):
                 if not limit > 0:
                     raise RobotError(f"joint '{name}' has the {what} limit {limit:g}, expected a number > 0")
-
-    def _check_mimics(self) -> None:
-        """Check that each mimic joint follows one of the n joints."""
-        followers = len(self.mimic_names)
-        require_shape("mimic_kinds", (len(self.mimic_kinds),), (followers,))
-        require_shape("mimic_leaders", (len(self.mimic_leaders),), (followers,))
-        for j, leader in enumerate(self.mimic_leaders):
-            _require_index(f"mimic_leaders[{j}]", leader, self.n - 1, least=0)
-            if self.mimic_factors[j] == 0:
-                raise InvalidValueError(f"mimic_factors[{j}]", 0, "a factor other than 0")
 
     def _check_frames(self) -> None:
         """Check the tip, further frames, and the bodies that carry them."""
@@ -354,6 +351,21 @@ def require_driven(what: str, tree: KinematicTree) -> None:
             f"{what} needs joints that motors drive, and no motor drives a floating base. Charts of it have fits, "
             "evaluation and inverse; Robot.zero_momentum has what moves the base"
         )
+
+
+def set_gravity(tree: KinematicTree, gravity: ArrayLike | None) -> KinematicTree:
+    """The tree under another gravity acceleration in the axes of the base, (3,) [m/s^2]; None changes nothing.
+
+    Raises:
+        ShapeError, InvalidValueError: if it is not three finite numbers.
+        RobotError: if the base floats, and gravity is not zero.
+    """
+    if gravity is None:
+        return tree
+    vector = freeze_array("gravity", gravity, (3,))
+    if tree.floating and vector.any():
+        raise RobotError(f"gravity is {vector.tolist()}, expected none: a base that nothing holds has no gravity")
+    return replace(tree, gravity=vector)
 
 
 _PLANAR = "planar"

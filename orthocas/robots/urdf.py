@@ -6,13 +6,14 @@ import os
 import re
 import sys
 import tempfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, suppress
 from copy import copy
 from dataclasses import dataclass
 from importlib import import_module
 from importlib.metadata import PackageNotFoundError, files
 from importlib.util import find_spec
+from itertools import product
 from pathlib import Path
 from threading import Lock
 from typing import Any
@@ -77,7 +78,7 @@ def read_urdf(path: str | Path) -> tuple[pin.Model, dict[str, Mimic]]:
         if joint.get("type") in ("revolute", "prismatic") and joint.find("limit") is None:
             ElementTree.SubElement(joint, "limit", lower=f"{-RULES.largest:g}", upper=f"{RULES.largest:g}")
         for limit in joint.findall("limit"):
-            missing = [what for what in ("effort", "velocity") if _is_unlimited(limit.get(what))]
+            missing = [what for what in ("effort", "velocity") if _read_number(limit.get(what, "-1")) == -1]
             limit.attrib.update(dict.fromkeys(missing, "0"))
             unlimited += [joint.get("name", "")] if missing else []
 
@@ -95,11 +96,8 @@ def read_urdf(path: str | Path) -> tuple[pin.Model, dict[str, Mimic]]:
     model, mimics = _read_mimics(model, used)
 
     if unlimited:
-        _log.warning(
-            "%s: limits are missing, or those of effort or velocity are -1, so there are none: %s",
-            path,
-            listed(unlimited),
-        )
+        text = "%s: limits are missing, or those of effort or velocity are -1, so there are none: %s"
+        _log.warning(text, path, listed(unlimited))
     _note_impossible_inertias(path, used)
     _, beside = _parse_urdf(ElementTree.tostring(root, "unicode"))
     if beside:
@@ -108,14 +106,22 @@ def read_urdf(path: str | Path) -> tuple[pin.Model, dict[str, Mimic]]:
 
 
 @contextmanager
-def _own_packages(expander: Any) -> Iterator[None]:
-    """What xacrodoc finds for one file is not kept for others: two workspaces may have packages of one name."""
+def _own_packages(expander: Any, path: Path) -> Iterator[None]:
+    """Let xacrodoc find the ROS packages that lie in the same folder as the package of a file.
+
+    What it finds for one file is not kept for others: two workspaces may have packages of one name.
+    """
+    root = next((folder for folder in path.parents if (folder / "package.xml").exists()), None)
+    beside = [] if root is None else [str(found.parent) for found in sorted(root.parent.glob("*/package.xml"))]
     with _PACKAGES:
         kept = expander.packages._finder
         own = copy(kept)
         own.finder_funcs, own.package_cache = list(kept.finder_funcs), dict(kept.package_cache)
         expander.packages._finder = own
         try:
+            if beside:
+                # after what the user and ROS name
+                expander.packages.look_in(beside, priority=sys.maxsize)
             yield
         finally:
             expander.packages._finder = kept
@@ -139,11 +145,7 @@ def read_urdf_xml(path: str | Path) -> ElementTree.Element:
     expander: Any = import_module(name)
     try:
         if name == "xacrodoc":
-            with _own_packages(expander):
-                beside = _find_packages_beside(Path(path).resolve())
-                if beside:
-                    # after what the user and ROS name
-                    expander.packages.look_in(beside, priority=sys.maxsize)
+            with _own_packages(expander, Path(path).resolve()):
                 text = expander.XacroDoc.from_file(str(path)).to_urdf_string()
         else:
             text = expander.process_file(str(path)).toxml()
@@ -158,42 +160,33 @@ def read_urdf_xml(path: str | Path) -> ElementTree.Element:
         )
         cause = f"{type(error).__name__}: {one_line(str(error))[:300]}{wanted}"
         raise RobotError(f"xacro cannot expand {path}: {cause}") from None
-    return _parse_xml(text.encode(), path, "URDF", "robot")
+    return read_xml(path, "URDF", "robot", text.encode())
 
 
-def _find_packages_beside(path: Path) -> list[str]:
-    """Folders of the ROS packages that lie in the same folder as the package of a file."""
-    root = next((folder for folder in path.parents if (folder / "package.xml").exists()), None)
-    return [] if root is None else [str(found.parent) for found in sorted(root.parent.glob("*/package.xml"))]
-
-
-def read_xml(path: str | Path, kind: str, tag: str | None = None) -> ElementTree.Element:
+def read_xml(path: str | Path, kind: str, tag: str | None = None, data: bytes | None = None) -> ElementTree.Element:
     """The root element of an XML file that may be broken or malicious.
 
     Args:
         path: the file.
         kind: expected kind of file for messages, "URDF", "xacro", "MJCF" or "SRDF".
         tag: expected name of the root element. None allows any name.
+        data: what a program made of the file, in place of its content.
 
     Raises:
         RobotError: if the file is missing, is not XML, has another root element, declares a document type (entities
             could fill the memory), or is larger or deeper than any robot.
     """
     try:
-        with Path(path).open("rb") as file:
-            return _parse_xml(file.read(RULES.bytes + 1), path, kind, tag)
-    except OSError as error:
-        raise RobotError(f"cannot read {kind} file {path}: {error.strerror}") from None
-
-
-def _parse_xml(data: bytes, path: str | Path, kind: str, tag: str | None) -> ElementTree.Element:
-    """The root element of the content of a file; see `read_xml`."""
-    try:
+        if data is None:
+            with Path(path).open("rb") as file:
+                data = file.read(RULES.bytes + 1)
         if len(data) > RULES.bytes:
             raise ValueError(f"it has more than {RULES.bytes} bytes")
         parser = ElementTree.XMLParser(target=_BoundedBuilder())
         parser.feed(data)
         root: ElementTree.Element = parser.close()
+    except OSError as error:
+        raise RobotError(f"cannot read {kind} file {path}: {error.strerror}") from None
     # LookupError stands for an unknown encoding.
     except (ElementTree.ParseError, LookupError, ValueError) as error:
         raise RobotError(f"{path} is not {_ARTICLE[kind]} {kind} file: {error}") from None
@@ -207,9 +200,7 @@ def _parse_xml(data: bytes, path: str | Path, kind: str, tag: str | None) -> Ele
 class _BoundedBuilder(ElementTree.TreeBuilder):
     """Builds the tree during parsing, and stops at anything that no robot file needs."""
 
-    def __init__(self) -> None:
-        super().__init__()
-        self._depth = self._elements = 0
+    _depth = _elements = 0
 
     def doctype(self, name: str, pubid: str | None, system: str | None) -> None:
         raise ValueError(f"it declares a document type ({name}), which orthocas does not allow")
@@ -242,11 +233,6 @@ def _check_macros(path: str | Path, root: ElementTree.Element) -> None:
         _log.warning("%s calls xacro macros that it does not have, which are left out: %s", path, lost)
 
 
-def _is_unlimited(text: str | None) -> bool:
-    """Whether a limit of effort or velocity is missing, or -1, by which some files mean the same."""
-    return text is None or (_is_negative(text) and float(text) == -1)
-
-
 def _add_lost_root(path: str | Path, root: ElementTree.Element) -> None:
     """Add the link that all others hang on, if joints name it and the file lacks it: a part for another robot."""
     links = {link.get("name", "") for link in root.findall("link")}
@@ -267,15 +253,16 @@ def _check_urdf(path: str | Path, root: ElementTree.Element) -> None:
     links = root.findall("link")
     if len(links) > RULES.links:
         raise RobotError(f"{path} has {len(links)} links, expected at most {RULES.links}")
-    for link in links:
+    # Names before anything else: every message below speaks of links and joints by name.
+    names = [link.get("name", "") for link in links]
+    for i, (name, link) in enumerate(zip(names, links, strict=True)):
+        if not name or name in names[:i]:
+            raise RobotError(f"{path}: two links are called '{name}'" if name else f"{path}: a link has no name")
         mass = link.find("inertial/mass")
-        if mass is not None and _is_negative(text := mass.get("value", "")):
-            raise RobotError(f"{path}: link '{link.get('name')}' has mass {text.strip()[:80]} kg, expected >= 0")
+        if mass is not None and _read_number(text := mass.get("value", "")) < 0:
+            raise RobotError(f"{path}: link '{name}' has mass {text.strip()[:80]} kg, expected >= 0")
     for joint in root.findall("joint"):
-        axis = joint.find("axis")
-        if axis is not None and joint.get("type") in ("revolute", "continuous", "prismatic"):
-            _check_axis(path, f"<axis> of joint '{joint.get('name')}'", axis.get("xyz"))
-        _check_numbers(path, joint)
+        _check_joint(path, joint)
     _check_tree(path, root)
 
 
@@ -296,56 +283,46 @@ def _note_impossible_inertias(path: str | Path, root: ElementTree.Element) -> No
         _log.warning("%s: no body has the principal moments of inertia of these links: %s", path, listed(odd, 3))
 
 
-def _check_numbers(path: str | Path, joint: ElementTree.Element) -> None:
-    """Limits of effort and velocity are not negative, and it is a number how a joint follows its leader."""
-    name, limit = joint.get("name"), joint.find("limit")
+def _check_joint(path: str | Path, joint: ElementTree.Element) -> None:
+    """The axis is a direction, limits of effort and velocity are not negative, and a mimic joint follows by numbers."""
+    name, axis, limit = joint.get("name"), joint.find("axis"), joint.find("limit")
+    if axis is not None and joint.get("type") in ("revolute", "continuous", "prismatic"):
+        if (text := axis.get("xyz")) is None:
+            raise RobotError(f"{path}: <axis> of joint '{name}' has no attribute 'xyz'")
+        words, unfit = text.split(), f"{path}: xyz of <axis> of joint '{name}' is '{text[:80]}', expected"
+        if len(words) != 3 or not all(_NUMBER.fullmatch(word) for word in words):
+            raise RobotError(f"{unfit} 3 numbers")
+        # Squares of numbers in words may overflow, unlike their hypotenuse.
+        length = math.hypot(*map(float, words))
+        if not length <= RULES.largest:
+            raise RobotError(f"{unfit} 3 numbers up to {RULES.largest:g}")
+        if length < RULES.shortest_axis:
+            raise RobotError(f"{unfit} a vector that is not zero")
     # Pinocchio's parser refuses some negative limits, and names no joint.
     for what in ("effort", "velocity"):
         text = "" if limit is None else limit.get(what, "")
-        if _is_negative(text):
+        if _read_number(text) < 0:
             label = f"<limit> of joint '{name}'"
             raise RobotError(f"{path}: {what} of {label} is '{text[:80]}', expected a number >= 0 (0: unlimited)")
     # It does not read mimic elements here.
-    for mimic in joint.findall("mimic"):
-        for what in ("multiplier", "offset"):
-            text = mimic.get(what, "0").strip()
-            if not _NUMBER.fullmatch(text) or abs(float(text)) > RULES.largest:
-                label = f"{what} of <mimic> of joint '{name}'"
-                raise RobotError(f"{path}: {label} is '{text[:80]}', expected a number up to {RULES.largest:g}")
+    for mimic, what in product(joint.findall("mimic"), ("multiplier", "offset")):
+        text = mimic.get(what, "0").strip()
+        if not _NUMBER.fullmatch(text) or abs(float(text)) > RULES.largest:
+            label = f"{what} of <mimic> of joint '{name}'"
+            raise RobotError(f"{path}: {label} is '{text[:80]}', expected a number up to {RULES.largest:g}")
 
 
-def _check_axis(path: str | Path, label: str, text: str | None) -> None:
-    """Raise RobotError unless the text is three plausible numbers, not all zero."""
-    if text is None:
-        raise RobotError(f"{path}: {label} has no attribute 'xyz'")
-    words = text.split()
-    unfit = f"{path}: xyz of {label} is '{text[:80]}', expected"
-    if len(words) != 3 or not all(_NUMBER.fullmatch(word) for word in words):
-        raise RobotError(f"{unfit} 3 numbers")
-    # Squares of numbers in words may overflow, unlike their hypotenuse.
-    length = math.hypot(*map(float, words))
-    if not length <= RULES.largest:
-        raise RobotError(f"{unfit} 3 numbers up to {RULES.largest:g}")
-    if length < RULES.shortest_axis:
-        raise RobotError(f"{unfit} a vector that is not zero")
-
-
-def _is_negative(text: str) -> bool:
-    """Whether a text is a number below 0; whether it is a number at all is left to Pinocchio's parser."""
+def _read_number(text: str) -> float:
+    """The number of a text, NaN for others: to refuse them is left to Pinocchio's parser."""
     try:
-        return float(text) < 0
+        return float(text)
     except ValueError:
-        return False
+        return math.nan
 
 
 def _check_tree(path: str | Path, root: ElementTree.Element) -> None:
     """Every joint connects two links of the file, every link but one hangs on one joint, and all hang on that one."""
-    names = [link.get("name", "") for link in root.findall("link")]
-    for i, name in enumerate(names):
-        if not name or name in names[:i]:
-            raise RobotError(f"{path}: two links are called '{name}'" if name else f"{path}: a link has no name")
-    # Names before anything else: every message below speaks of links and joints by name.
-    joints = []
+    joints, names = [], [link.get("name", "") for link in root.findall("link")]
     for joint in root.findall("joint"):
         ends = (joint.find(end) for end in ("parent", "child"))
         parent, child = ("" if end is None else end.get("link", "") for end in ends)
@@ -370,19 +347,10 @@ def _check_tree(path: str | Path, root: ElementTree.Element) -> None:
     roots = [link for link in names if link not in carriers]
     if len(roots) > 1:
         raise RobotError(f"{path}: the links '{roots[0]}' and '{roots[1]}' hang on no joint, expected one such link")
-    _check_loops(path, joints, children, roots)
-
-
-def _check_loops(
-    path: str | Path, joints: Sequence[tuple[str, str, str]], children: Mapping[str, list[str]], roots: list[str]
-) -> None:
-    """Every joint (name, parent, child) can be reached from a root."""
     # What no walk from the roots reaches hangs in a loop.
-    reached, waiting = set(roots), list(roots)
-    while waiting:
-        new = [child for child in children.get(waiting.pop(), ()) if child not in reached]
-        reached.update(new)
-        waiting += new
+    reached = list(roots)
+    for link in reached:
+        reached += children.get(link, ())
     for name, parent, child in joints:
         if parent not in reached:
             raise RobotError(

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import json
+from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
+from math import inf, isfinite
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,7 +21,7 @@ from orthocas.robots.kinematics import build_point_jacobian
 from orthocas.robots.tree import KinematicTree
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, as_float_array, freeze_array, require_count, require_known, require_shape
-from orthocas.tools.json import Reader
+from orthocas.tools.json import read_strict_json
 
 Link = str | int | None  #: a link, by the joint that moves it (name or index), or a frame by its name; None: the tip
 _WITH_STEPS = ("steps", "duration", "start", "natural_frequency", "damping_ratio", "pushes")
@@ -42,6 +44,10 @@ class SimulationRules:
     beyond: float = 1e-3  #: a joint limit: stops give way a little [rad] or [m]
     lasting: float = 0.1  #: at the limit, from which on the storage must not rise [s]
     no_step: float = 1e-9  #: smaller differences of targets are rounding
+
+    steps_file: int = 2**23  #: bytes of a steps file
+    largest: float = 1e6  #: of its numbers; larger ones are mistakes and would overflow later
+    longest: int = 80  #: most characters of it that an error repeats
 
 
 RULES = SimulationRules()
@@ -413,3 +419,72 @@ def _read_pushes(reader: Reader, data: object, joint_names: tuple[str, ...], run
         point = reader.numbers(entry.get("point", [0.0] * 3), f"{where}.point", 3)
         pushes.append(Push(start, duration, force, torque, link, point))
     return tuple(pushes)
+
+
+@dataclass(frozen=True)
+class Reader:
+    """Reads values from a steps file. Every method raises StepsFileError for data of the wrong kind."""
+
+    path: Path
+
+    def parsed(self) -> object:
+        """The data of the file. NaN and duplicate keys are errors."""
+        try:
+            with self.path.open("rb") as stream:
+                content = stream.read(RULES.steps_file + 1)
+        except OSError as error:
+            raise self.fault(f"cannot be read, {error.strerror}") from None
+        # ValueError stands for a path with a zero.
+        except ValueError as error:
+            raise self.fault(f"cannot be read, {error}") from None
+        if len(content) > RULES.steps_file:
+            raise self.fault(f"larger than {RULES.steps_file / 2**20:.0f} MiB, no steps file")
+        try:
+            return read_strict_json(content.decode("utf-8-sig"))
+        # ValueError also stands for bytes that are no text.
+        except ValueError as error:
+            raise self.fault(f"truncated or not JSON, {str(error)[: RULES.longest]}") from None
+
+    def fault(self, text: str) -> StepsFileError:
+        """An error that names the file."""
+        return StepsFileError(f"steps file {self.path}: {text}")
+
+    def wrong(self, where: str, got: object, want: str) -> StepsFileError:
+        """An error that names the place, the value there and what was expected."""
+        return self.fault(f"{where} is {json.dumps(got)[: RULES.longest]}, expected {want}")
+
+    def fields(self, data: object, where: str, known: Collection[str], what: str = "key") -> dict[str, Any]:
+        """An object that has only known keys."""
+        if not isinstance(data, dict):
+            raise self.wrong(where, data, "an object")
+        for key in data:
+            if key not in known:
+                names = ", ".join(known)
+                raise self.fault(f"{where} has an unknown {what} '{key[: RULES.longest]}', known: {names}")
+        return data
+
+    def items(self, data: object, where: str) -> list[Any]:
+        """Return the data if it is a list; raise otherwise."""
+        if not isinstance(data, list):
+            raise self.wrong(where, data, "a list")
+        return data
+
+    def number(self, data: object, where: str, least: float = -RULES.largest, above: float = -inf) -> float:
+        """A number that is at least `least` or above `above`, and at most 1e6."""
+        if data is None:
+            raise self.fault(f"{where} is missing, expected a number")
+        low = f"above {above:g}" if isfinite(above) else f"from {least:g}"
+        if (
+            isinstance(data, bool)
+            or not isinstance(data, int | float)
+            or not (above < data and least <= data <= RULES.largest)
+        ):
+            raise self.wrong(where, data, f"a number {low} to {RULES.largest:g}")
+        return float(data)
+
+    def numbers(self, data: object, where: str, length: int) -> Array:
+        """A list of finite numbers, (length,)."""
+        items = self.items(data, where)
+        if len(items) != length:
+            raise self.wrong(where, items, f"a list of {length} numbers")
+        return np.array([self.number(item, f"{where}[{i}]") for i, item in enumerate(items)])

@@ -83,7 +83,7 @@ class ClosedLoop:
             torque -= self.friction.torque(dq, numbers[: 4 * n])
         inertials = numbers[4 * n :] if self.rubs else numbers
         tree = self.plant.tree
-        ddq = dynamics.build_forward_dynamics(tree, q, dq, torque, tree.gravity, inertials)
+        ddq = dynamics.build_forward_dynamics(tree, q, dq, torque, inertials)
         return ca.Function("plant", [ca.vertcat(q, dq), command, load, numbers], [ca.vertcat(dq, ddq)])
 
     @property

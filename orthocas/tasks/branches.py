@@ -219,8 +219,13 @@ def branches(robot: Robot, task: Task | None = None) -> Branches:
     parts = [range(1 + sum(cut.joint == k for cut in cuts)) for k in sorted({cut.joint for cut in cuts})]
     candidates = [_build_branch(whole, cuts, sides, points, values) for sides in product(*parts)]
     items = [item for item in candidates if item]
-    if task is not None or len(arms) == 1:
-        items = [_add_clearance(item, robot, task or arms[0].task, points, values) for item in items]
+    # the clearance that a branch allows, where its values do not make sure of the usual one
+    served = task or (arms[0].task if len(arms) == 1 else None)
+    if served is not None and served.m < robot.n:
+        for k, item in enumerate(items):
+            if values[item.box.contains(points)].max() <= RULES.surely * RULES.nonsingular:
+                largest = float(sample_centres(robot, served, item.box)[1].max()) / RULES.of_centre
+                items[k] = replace(item, clearance=min(RULES.nonsingular, math.floor(1e3 * largest) / 1e3))
     items.sort(key=lambda item: -item.share)
     mirrors = tuple(i for i, cut in enumerate(cuts) if _is_mirror(robot, cut, points[:50]))
     return Branches(robot, cuts, tuple(items), mirrors)
@@ -290,7 +295,14 @@ class _Arm:
         for singular, sizes in zip((True, False), of_slices.T, strict=True):
             if not np.isfinite(sizes).any() or (not singular and np.nanmax(sizes) < RULES.still):
                 continue
-            for i in _find_minima(sizes, RULES.low * float(np.nanmax(sizes))):
+            # inner slices that are the lowest of their neighbours and low, the lowest first
+            low_enough, near = RULES.low * float(np.nanmax(sizes)), RULES.neighbours
+            minima = [
+                i
+                for i in range(1, len(sizes) - 1)
+                if sizes[i] <= low_enough and sizes[i] == np.nanmin(sizes[max(0, i - near) : i + near + 1])
+            ]
+            for i in sorted(minima, key=lambda i: float(sizes[i])):
                 cut, size = self._refine_cut(k, values, i, singular)
                 if all(abs(cut.value - other.value) > RULES.apart for other, _ in cuts):
                     cuts.append((cut, size))
@@ -395,28 +407,10 @@ def _scale_to_range(robot: Robot, task: Task) -> Callable[[Array], Array]:
     return values
 
 
-def _add_clearance(branch: Branch, robot: Robot, task: Task, points: Array, values: Array) -> Branch:
-    """The branch with the clearance that it allows; the values at points are those in the joint range."""
-    if task.m >= robot.n or values[branch.box.contains(points)].max() > RULES.surely * RULES.nonsingular:
-        return branch
-    largest = float(sample_centres(robot, task, branch.box)[1].max()) / RULES.of_centre
-    return replace(branch, clearance=min(RULES.nonsingular, math.floor(1e3 * largest) / 1e3))
-
-
 def _evaluate_jacobians(task: Task, points: Array) -> Array:
     """Frame Jacobians, zero where they are not finite, (N, m, n)."""
     J: Array = task.batched_frame_jacobian(points)[0].reshape(len(points), task.m, points.shape[1])
     return np.where(np.isfinite(J), J, 0.0)
-
-
-def _find_minima(sizes: Array, limit: float) -> list[int]:
-    """Inner slices that are the lowest of their neighbours and below a limit, the lowest first."""
-    minima = []
-    for i in range(1, len(sizes) - 1):
-        near = sizes[max(0, i - RULES.neighbours) : i + RULES.neighbours + 1]
-        if sizes[i] <= limit and sizes[i] == np.nanmin(near):
-            minima.append(i)
-    return sorted(minima, key=lambda i: float(sizes[i]))
 
 
 def _build_branch(

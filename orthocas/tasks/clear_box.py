@@ -10,8 +10,10 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from orthocas.errors import DomainError, InvalidValueError, SingularTaskError
+from orthocas.errors import DomainError, InvalidValueError, OrthocasError, SingularTaskError
+from orthocas.robots.robot import Robot
 from orthocas.tasks.domains import Box, Domain, StopKind, Wall, register_domain, require_within_limits
+from orthocas.tasks.regular_box import regular_box
 from orthocas.tasks.samples import compute_row_scale, sample_evenly, sample_uniform
 from orthocas.tasks.task import Task
 from orthocas.tools.batch import dense_function
@@ -30,6 +32,10 @@ class ClearBoxRules:
 
     samples: int = 256  #: of the box, for the scale of the rows
     fraction_samples: int = 20_000  #: of the box, for the fraction of it that is nonsingular
+    default_samples: int = 4096  #: of the default box, to see whether it holds near-singular positions
+    near: float = 0.03  #: relative singular value below which it does: charts of the whole box would fold there
+    centre_share: float = 0.6  #: bound of the part that is the default domain then, over the value at the centre
+    largest_bound: float = 0.2  #: and the largest such bound
     seed: int = 0
 
 
@@ -262,6 +268,32 @@ class ClearBox(Box):
         batched = self.task.batched_jacobian if self.rows == "x" else self.task.batched_frame_jacobian
         J: Array = batched(points)[0].reshape(len(points), self.task.m, len(self.centre))
         return J
+
+
+def default_domain(robot: Robot, task: Task) -> Box:
+    """The domain of a problem that names none: `regular_box`, or its clear part if it holds near-singular positions.
+
+    There coordinates of the whole box would fold over. The bound is 60 % of the relative singular value of the
+    centre, at most 0.2.
+
+    Args:
+        robot: the robot.
+        task: a task of that robot. A missing reference is taken at the centre of the box.
+
+    Raises:
+        NotRedundantError: if the task has as many components as the robot has joints.
+    """
+    box = regular_box(robot, task)
+    try:
+        measured = ClearBox(box, task, np.finfo(float).tiny)
+        values = measured.singular_values(sample_evenly(box, RULES.default_samples, RULES.seed))
+        if np.nanmin(values) >= RULES.near:
+            return box
+        bound = min(RULES.largest_bound, RULES.centre_share * measured.singular_values(box.centre))
+        return ClearBox(box, task, round(bound, 2), measured.scale)
+    # a task that is singular in the centre too, or everywhere: `check` says what is wrong
+    except OrthocasError:
+        return box
 
 
 def exclude_singular(domain: Domain, task: Task, least_singular_value: float | None) -> Domain:

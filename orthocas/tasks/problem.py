@@ -13,10 +13,9 @@ from numpy.typing import NDArray
 from orthocas.errors import InvalidValueError, MetricError, NotRedundantError, SingularTaskError
 from orthocas.robots.robot import Robot
 from orthocas.robots.tree import KinematicTree
-from orthocas.tasks.clear_box import exclude_singular
+from orthocas.tasks.clear_box import default_domain, exclude_singular
 from orthocas.tasks.domains import Domain, domain_from_data, require_within_limits
 from orthocas.tasks.metric import Metric, MetricSpec
-from orthocas.tasks.regular_box import regular_box
 from orthocas.tasks.samples import compute_row_scale, sample_uniform
 from orthocas.tasks.task import Task
 from orthocas.tools.archive import Stored
@@ -43,7 +42,8 @@ class Problem(Shown):
         robot: the robot.
         task: a task of that robot, m < n. If it lacks a reference orientation, the one at the domain's centre is used.
         metric: "euclidean", "inertia", a constant SPD matrix (n, n), a map q -> A(q) on SX, or a Metric.
-        domain: Box or Torus inside the joint limits. Default: `regular_box(robot, task)`, away from singular postures.
+        domain: Box or Torus inside the joint limits. Default: a box of 45 degrees about the middle of the limits,
+            or about a bent posture where the task is regular; without its near-singular positions if it has some.
         name: for reports.
         least_singular_value: leaves out of the domain, a Box, all positions where the relative singular value of the
             task is smaller; see `orthocas.ClearBox`. Default: no bound.
@@ -87,7 +87,7 @@ class Problem(Shown):
         if task.m >= robot.n - len(robot.tree.floating):
             raise NotRedundantError(task.m, robot.n - len(robot.tree.floating))
         # The domain lies within the limits; its centre gives a missing reference.
-        domain = regular_box(robot, task) if domain is None else domain
+        domain = default_domain(robot, task) if domain is None else domain
         if not isinstance(domain, Domain):
             raise InvalidValueError("domain", repr(domain), "a Box, a Torus or another Domain")
         require_within_limits(robot, domain)

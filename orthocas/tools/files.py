@@ -164,23 +164,16 @@ def remove_drafts(folder: Path) -> None:
     # A folder that cannot be listed or changed fails elsewhere, with a message.
     with suppress(OSError):
         for entry in list(os.scandir(folder)):
-            if _is_abandoned(entry.name) and entry.is_dir(follow_symlinks=False):
+            parts = _NAME.fullmatch(entry.name)
+            if parts is None or parts["host"] != _HOST or not entry.is_dir(follow_symlinks=False):
+                continue
+            try:
+                os.kill(int(parts["process"]), 0)
+            except (ProcessLookupError, OverflowError):
                 shutil.rmtree(entry.path, ignore_errors=True)
-
-
-def _is_abandoned(name: str) -> bool:
-    """Whether a draft folder belongs to a process of this machine that no longer runs."""
-    parts = _NAME.fullmatch(name)
-    if parts is None or parts["host"] != _HOST:
-        return False
-    try:
-        os.kill(int(parts["process"]), 0)
-    except (ProcessLookupError, OverflowError):
-        return True
-    # Other errors say that it is another user's.
-    except OSError:
-        return False
-    return False
+            # Other errors say that it runs for another user.
+            except OSError:
+                pass
 
 
 @contextmanager

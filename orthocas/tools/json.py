@@ -1,33 +1,18 @@
-"""JSON of results, and strict reading of JSON: what programs wrote, and what people write."""
+"""JSON of results, and strict reading of JSON."""
 
 import json
 import math
 from collections import Counter
-from collections.abc import Collection, Mapping
-from dataclasses import dataclass, fields, is_dataclass
-from math import inf, isfinite
-from pathlib import Path
+from collections.abc import Mapping
+from dataclasses import fields, is_dataclass
 from typing import Any, TypeVar
 
 import numpy as np
 
-from orthocas.errors import InvalidValueError, StepsFileError
-from orthocas.tools.checks import Array
+from orthocas.errors import InvalidValueError
 
 T = TypeVar("T")
 _KINDS: dict[type, str] = {dict: "an object", list: "a list", str: "text"}
-
-
-@dataclass(frozen=True, slots=True)
-class JsonRules:
-    """Bounds of what people write."""
-
-    file: int = 2**23  #: bytes of a file
-    largest: float = 1e6  #: larger numbers are mistakes and would overflow later
-    longest: int = 80  #: most characters of the input that an error repeats
-
-
-RULES = JsonRules()
 
 
 def clean(value: Any) -> Any:
@@ -120,72 +105,3 @@ def _parse_finite(text: str) -> float:
     if not math.isfinite(value):
         _refuse_constant(text[:80])
     return value
-
-
-@dataclass(frozen=True)
-class Reader:
-    """Reads values from JSON data. Every method raises StepsFileError for data of the wrong kind."""
-
-    path: Path
-
-    def parsed(self) -> object:
-        """The data of the file. NaN and duplicate keys are errors."""
-        try:
-            with self.path.open("rb") as stream:
-                content = stream.read(RULES.file + 1)
-        except OSError as error:
-            raise self.fault(f"cannot be read, {error.strerror}") from None
-        # ValueError stands for a path with a zero.
-        except ValueError as error:
-            raise self.fault(f"cannot be read, {error}") from None
-        if len(content) > RULES.file:
-            raise self.fault(f"larger than {RULES.file / 2**20:.0f} MiB, no steps file")
-        try:
-            return read_strict_json(content.decode("utf-8-sig"))
-        # ValueError also stands for bytes that are no text.
-        except ValueError as error:
-            raise self.fault(f"truncated or not JSON, {str(error)[: RULES.longest]}") from None
-
-    def fault(self, text: str) -> StepsFileError:
-        """An error that names the file."""
-        return StepsFileError(f"steps file {self.path}: {text}")
-
-    def wrong(self, where: str, got: object, want: str) -> StepsFileError:
-        """An error that names the place, the value there and what was expected."""
-        return self.fault(f"{where} is {json.dumps(got)[: RULES.longest]}, expected {want}")
-
-    def fields(self, data: object, where: str, known: Collection[str], what: str = "key") -> dict[str, Any]:
-        """An object that has only known keys."""
-        if not isinstance(data, dict):
-            raise self.wrong(where, data, "an object")
-        for key in data:
-            if key not in known:
-                names = ", ".join(known)
-                raise self.fault(f"{where} has an unknown {what} '{key[: RULES.longest]}', known: {names}")
-        return data
-
-    def items(self, data: object, where: str) -> list[Any]:
-        """Return the data if it is a list; raise otherwise."""
-        if not isinstance(data, list):
-            raise self.wrong(where, data, "a list")
-        return data
-
-    def number(self, data: object, where: str, least: float = -RULES.largest, above: float = -inf) -> float:
-        """A number that is at least `least` or above `above`, and at most 1e6."""
-        if data is None:
-            raise self.fault(f"{where} is missing, expected a number")
-        low = f"above {above:g}" if isfinite(above) else f"from {least:g}"
-        if (
-            isinstance(data, bool)
-            or not isinstance(data, int | float)
-            or not (above < data and least <= data <= RULES.largest)
-        ):
-            raise self.wrong(where, data, f"a number {low} to {RULES.largest:g}")
-        return float(data)
-
-    def numbers(self, data: object, where: str, length: int) -> Array:
-        """A list of finite numbers, (length,)."""
-        items = self.items(data, where)
-        if len(items) != length:
-            raise self.wrong(where, items, f"a list of {length} numbers")
-        return np.array([self.number(item, f"{where}[{i}]") for i, item in enumerate(items)])

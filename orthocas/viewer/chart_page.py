@@ -1,4 +1,7 @@
-"""The page of a chart: sliders and a handle solved live, bars, ghosts, home, undo, a sweep, a path, a recording."""
+"""The page of a chart: sliders and a handle solved live, bars, ghosts, home, undo, a sweep, a path, a recording.
+
+With collisions, solids of the scene, the nearest pair, and pairs that touch in red.
+"""
 
 import time
 from collections.abc import Callable
@@ -9,19 +12,20 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 from scipy.spatial.transform import Rotation
 
 from orthocas.charts.chart import Chart
 from orthocas.charts.self_motion import Fan, fan_along
 from orthocas.errors import ViewError
 from orthocas.paths.tool_path import read_path
-from orthocas.robots.collisions import Collisions
+from orthocas.robots.collisions import Collisions, LeastDistance, Part
+from orthocas.robots.shapes import Shape
 from orthocas.tasks.branches import branches
-from orthocas.tools.checks import Array
-from orthocas.viewer.contacts import Contacts
-from orthocas.viewer.looks import RULES, Arm, Ghosts, Look, build_shape, compute_chain_length
+from orthocas.tools.checks import Array, Indices
+from orthocas.viewer.looks import RULES, Arm, BodyPoses, Colour, Ghosts, Look, build_shape, compute_chain_length
 from orthocas.viewer.motion import join_waypoints, write_joints
-from orthocas.viewer.panel import ChartPanel
+from orthocas.viewer.panel import ChartPanel, choose_colour, format_bar
 from orthocas.viewer.session import Session, describe_stop
 from orthocas.viewer.window import Loop, place_panels, place_scene, show_error
 
@@ -385,7 +389,15 @@ class ChartPage:
     def _show_chosen(self) -> None:
         """Draw another coordinate's fan and ends."""
         self._show()
-        self._show_fan()
+        fan = self._find_fan()
+        with self._server.atomic():
+            if fan is None:
+                self._ghosts.hide()
+                return
+            # What the arm can have of the fan.
+            fans = (fan.spread(RULES.ghosts), fan.spread(4 * RULES.ghosts))
+            few, many = (self.session.mirror(q[self.session.find_allowed(q)]) for q in fans)
+            self._ghosts.show(few, many, [f"{fan.label} = {value:.3f}" for value in (fan.xi[0], fan.xi[-1])])
 
     def _format_ends(self) -> str:
         """What ends the chosen coordinate, as a part of the readings; a mirrored arm ends elsewhere."""
@@ -397,17 +409,70 @@ class ChartPage:
         lines = [f"{value:.3f}: {escape(describe_stop(stop, robot))}" for value, stop in ends]
         return f'<h4>ends of {escape(fan.label)}</h4><div class="about">{"<br>".join(lines)}</div>'
 
-    def _show_fan(self) -> None:
-        fan = self._find_fan()
-        with self._server.atomic():
-            if fan is None:
-                self._ghosts.hide()
-            else:
-                # What the arm can have of the fan.
-                fans = (fan.spread(RULES.ghosts), fan.spread(4 * RULES.ghosts))
-                few, many = (self.session.mirror(q[self.session.find_allowed(q)]) for q in fans)
-                self._ghosts.show(few, many, [f"{fan.label} = {value:.3f}" for value in (fan.xi[0], fan.xi[-1])])
-
     def _show_failure(self, error: Exception) -> None:
         self._rest()
         show_error(self._server, error)
+
+
+class Contacts:
+    """Draws solids of the scene, the line between the nearest points, and the pair in red where it is close."""
+
+    def __init__(self, scene: Any, collisions: Collisions) -> None:
+        self._scene, self._collisions = scene, collisions
+        self._poses = BodyPoses(collisions.tree)
+        self._nodes: list[Any] = []
+        links = set(collisions.tree.frame_names) | {collisions.tree.tip_name}
+        fixed = [part for part in collisions.parts if part.body < 0 and part.name not in links and part.shape.bounded]
+        for k, part in enumerate(fixed):
+            self._add(f"/solids/{k}", part, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), RULES.solid, 1.0)
+
+    def show(self, q: Array) -> str:
+        """Show them at a posture (n,); returns a part of the panel."""
+        found = self._collisions.distance(q)
+        for node in self._nodes:
+            node.remove()
+        self._nodes = []
+        if np.isfinite(found.points).all():
+            colour = RULES.touching if found.distance < RULES.close_links else RULES.solid
+            shade = np.tile(np.array(colour, dtype=np.uint8), (1, 2, 1))
+            ends = found.points[None].astype(np.float32)
+            line = self._scene.add_line_segments("/nearest", ends, shade, thickness=RULES.link_line)
+            self._nodes.append(line)
+        if found.distance < RULES.close_links:
+            positions, quaternions = self._poses(q[None])
+            for k, part in enumerate(part for part in self._collisions.parts if part.name in found.pair):
+                if part.shape.bounded:
+                    place = positions[0, part.body + 1], quaternions[0, part.body + 1]
+                    self._nodes.append(self._add(f"/close/{k}", part, *place, RULES.touching, 0.5))
+        return format_nearest(found)
+
+    def _add(self, name: str, part: Part, position: Array, quaternion: Array, colour: Colour, opacity: float) -> Any:
+        vertices, faces = build_hull(part.shape)
+        return self._scene.add_mesh_simple(
+            name, vertices.astype(np.float32), faces, color=colour, opacity=opacity, position=tuple(position),
+            wxyz=tuple(quaternion), cast_shadow=False, receive_shadow=False,
+        )  # fmt: skip
+
+
+def build_hull(shape: Shape) -> tuple[Array, Indices]:
+    """Vertices (V, 3) and triangles (F, 3) of the convex hull of a solid, in the frame of its body."""
+    corners, rounding = shape.list_corners()
+    if rounding:
+        angles = 2 * np.pi * np.arange(RULES.facets) / RULES.facets
+        heights = np.linspace(-1, 1, RULES.facets // 2)
+        ring = np.column_stack([np.cos(angles), np.sin(angles)])
+        ball = np.vstack([np.column_stack([np.sqrt(1 - z * z) * ring, np.full(len(ring), z)]) for z in heights])
+        corners = (corners[:, None] + rounding * ball).reshape(-1, 3)
+    hull = scipy.spatial.ConvexHull(corners, qhull_options="QJ")
+    return hull.points, np.asarray(hull.simplices, dtype=np.int64)
+
+
+def format_nearest(found: LeastDistance) -> str:
+    """A part of the panel: the nearest pair, and how far it is."""
+    if not np.isfinite(found.distance):
+        return "<h4>collisions</h4>no pair is checked"
+    first, second = (escape(name) for name in found.pair)
+    text = "touch" if found.distance <= 0 else f"{1e3 * found.distance:.0f} mm"
+    colour = choose_colour(found.distance, RULES.near_links, RULES.close_links)
+    bar = format_bar("nearest pair", found.distance / RULES.far_links, text, colour, found.distance)
+    return f'<h4>collisions</h4>{bar}<div class="about">{first} and {second}</div>'

@@ -12,8 +12,8 @@ import numpy as np
 import scipy
 
 from orthocas.errors import RobotError
+from orthocas.robots.collision_files import load_mesh, place_links, read_numbers, read_pose
 from orthocas.robots.kinematics import build_body_poses, build_tip_pose
-from orthocas.robots.link_shapes import load_mesh, place_links, read_numbers, read_pose
 from orthocas.robots.robot import Robot
 from orthocas.robots.spatial import rotate_z_to
 from orthocas.robots.tree import KinematicTree
@@ -87,6 +87,13 @@ class ViewRules:
     rate: int = 30  #: recorded pictures a second
     recorded_sweep: float = 5.0  #: of one coordinate [s]
     recorded_length: float = 120.0  #: longer motions are recorded faster [s]
+
+    far_links: float = 0.3  #: [m]: a full bar
+    near_links: float = 0.1  #: [m]: amber below
+    close_links: float = 0.02  #: [m]: red below, and the pair with it
+    link_line: float = 0.004  #: thickness of the line between nearest points [m]
+    touching: Colour = (214, 69, 69)
+    solid: Colour = (150, 158, 168)
 
     brand: Colour = (31, 95, 168)
     panel_widths: tuple[int, int] = (320, 300)  #: of readings and sliders [px]
@@ -342,18 +349,11 @@ def _build_solid(
         radius, length = (float(read_numbers(shape, name, 1, (0.1,))[0]) for name in ("radius", "length"))
         return build_drum(radius, length / 2, colour)
     if shape.tag == "mesh":
-        return _load_mesh(path, shape, colour, missing)
+        try:
+            return Solid(*load_mesh(path, shape), colour)
+        except ValueError:
+            missing.append(shape.get("filename", ""))
     return None
-
-
-def _load_mesh(path: Path, shape: ElementTree.Element, colour: Colour, missing: list[str]) -> Solid | None:
-    """The triangles of a mesh file; None if it cannot be found or read."""
-    try:
-        vertices, faces = load_mesh(path, shape)
-    except ValueError:
-        missing.append(shape.get("filename", ""))
-        return None
-    return Solid(vertices, faces, colour)
 
 
 class BodyPoses:

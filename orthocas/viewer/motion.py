@@ -11,8 +11,7 @@ from numpy.typing import NDArray
 from orthocas.charts.chart import Chart
 from orthocas.charts.trackers import TrackerStatus
 from orthocas.errors import InvalidValueError, PathError, PathFileError
-from orthocas.paths.joint_motion import JointMotion
-from orthocas.paths.recordings import read_joints
+from orthocas.paths.joint_motion import JointMotion, read_joints
 from orthocas.robots.robot import Robot
 from orthocas.simulation.trajectory import Trajectory
 from orthocas.tools.checks import Array, as_float_array, as_point_set, freeze_array, require_count, require_kind
@@ -172,7 +171,12 @@ def cyclic_motions(chart: Chart, path: Array | None = None, cycles: int = 3) -> 
     if path is None:
         along, q = _find_largest_circle(chart, start, fractions)
     else:
-        along = _build_polygon(chart, path)
+        # A closed path, measured in the sizes of the task.
+        points, _ = as_point_set("path", path, chart.m)
+        sizes = chart.parts.phi_sizes[: chart.m]
+        if len(points) < 3 or np.abs((points[-1] - points[0]) / sizes).max() > RULES.same_ends:
+            raise PathError(f"the path of {len(points)} waypoints is not closed, expected its last to be its first")
+        along = join_waypoints(points, sizes)
         q = _follow_with_constant_xi(chart, along(fractions), start)
     x = along(fractions)
     ends = tuple(RULES.cycle * (k + 1) for k in range(cycles))
@@ -207,16 +211,6 @@ def _find_largest_circle(chart: Chart, start: Array, fractions: Array) -> tuple[
             except PathError as error:
                 last = error
     raise last
-
-
-def _build_polygon(chart: Chart, path: Array) -> Place:
-    """Straight lines between the waypoints of a closed path."""
-    # A closed path, measured in the sizes of the task.
-    points, _ = as_point_set("path", path, chart.m)
-    sizes = chart.parts.phi_sizes[: chart.m]
-    if len(points) < 3 or np.abs((points[-1] - points[0]) / sizes).max() > RULES.same_ends:
-        raise PathError(f"the path of {len(points)} waypoints is not closed, expected its last to be its first")
-    return join_waypoints(points, sizes)
 
 
 def join_waypoints(points: Array, sizes: Array) -> Place:

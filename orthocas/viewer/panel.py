@@ -1,6 +1,6 @@
 """Readings of a joint position as a small page of HTML: numbers and bars."""
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
 from itertools import takewhile
@@ -88,11 +88,8 @@ class ChartPanel:
         problem = chart.problem
         # Bars of the joints, with the domain unless the arm is mirrored out of it.
         robot, domain = problem.robot, problem.domain
-        low, high = (-np.inf, np.inf) if mirrored else domain.bounds
-        self._joints = JointBars(
-            robot.joint_names, robot.tree.prismatic, robot.lower, robot.upper, low + np.zeros(chart.n),
-            high + np.zeros(chart.n),
-        )  # fmt: skip
+        low, high = (None, None) if mirrored else domain.bounds
+        self._joints = JointBars(robot, low, high)
         self._labels, self._units = chart.labels, problem.task.units
         self._half_width = float(domain.half_width.min())
         # Whose chart it is, which does not change.
@@ -153,17 +150,17 @@ class ChartPanel:
 class JointBars:
     """One bar for each joint: its limits, the domain as a darker band, and where the joint is."""
 
-    def __init__(
-        self, names: Sequence[str], prismatic: Iterable[bool], lower: Array, upper: Array, low: Array, high: Array
-    ) -> None:
+    def __init__(self, robot: Robot, low: Array | None = None, high: Array | None = None) -> None:
         # Tracks from limit to limit, or over the domain, or a full turn; the domain is a band in them.
-        low, high = np.maximum(low, lower), np.minimum(high, upper)
+        names, lower, upper = robot.joint_names, robot.lower, robot.upper
+        low = lower if low is None else np.maximum(low, lower)
+        high = upper if high is None else np.minimum(high, upper)
         ends = np.where(np.isfinite(lower), lower, np.where(np.isfinite(low), low, -np.pi))
         tops = np.where(np.isfinite(upper), upper, np.where(np.isfinite(high), high, np.pi))
         spans = np.maximum(tops - ends, 1e-9)
         bands = np.clip(np.column_stack([low - ends, high - ends]) / spans[:, None], 0, 1)
         self.shown = strip_shared_words(names)
-        self._slides = tuple(prismatic)
+        self._slides = robot.tree.prismatic
         places = zip(ends.tolist(), spans.tolist(), bands.tolist(), strict=True)
         self._joints = list(zip(names, self.shown, range(len(self.shown)), places, strict=True))
 
@@ -255,11 +252,7 @@ class RobotPanel:
     """Writes the joints and the tip of a robot."""
 
     def __init__(self, robot: Robot) -> None:
-        self._robot = robot
-        endless = np.full(robot.n, np.inf)
-        self._joints = JointBars(
-            robot.joint_names, robot.tree.prismatic, robot.lower, robot.upper, -endless, endless
-        )  # fmt: skip
+        self._robot, self._joints = robot, JointBars(robot)
         self._head = (
             f'<div class="name">{escape(name_robot(robot))}</div>'
             f'<div class="about">{robot.n} joints, {robot.tree.masses.sum():.4g} kg<br>'
@@ -284,13 +277,8 @@ class PlayerPanel:
     """Writes where motions are: quantities of one motion, or how far the joints of several are from their start."""
 
     def __init__(self, robot: Robot, motions: Sequence[Motion], units: Mapping[str, str] | None = None) -> None:
-        self._units = units or {}
-        endless = np.full(robot.n, np.inf)
-        self._motions = motions
+        self._units, self._motions, self._joints = units or {}, motions, JointBars(robot)
         self._prismatic = np.array(robot.tree.prismatic)
-        self._joints = JointBars(
-            robot.joint_names, robot.tree.prismatic, robot.lower, robot.upper, -endless, endless
-        )  # fmt: skip
 
     def format_html(self, seconds: float) -> str:
         """The page some seconds after the start."""

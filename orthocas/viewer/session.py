@@ -6,8 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocas.charts.chart import Chart
-from orthocas.charts.self_motion import Stop, Walls, fan_along
+from orthocas.charts.self_motion import fan_along
 from orthocas.charts.trackers import TrackerStatus
+from orthocas.charts.walls import Stop, Walls
 from orthocas.errors import InvalidValueError
 from orthocas.robots.robot import Robot
 from orthocas.tasks.branches import Branches

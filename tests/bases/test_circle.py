@@ -10,7 +10,7 @@ import pytest
 import orthocas as oc
 from orthocas import solvers
 from orthocas.bases import JointSpace
-from orthocas.bases.circle import CircleFamily
+from orthocas.bases.composed import CircleFamily
 from orthocas.certificates import check_certificate
 from orthocas.charts.coordinates import Coordinates
 from orthocas.codegen import check_c

@@ -9,7 +9,7 @@ from orthocas import problems, solvers
 from orthocas.bases import JointSpace
 from orthocas.errors import InfeasibleError, InvalidValueError, SolveError
 from orthocas.fitting.basis_objective import BasisObjective
-from orthocas.fitting.bounded_mutual import BoundedMutual
+from orthocas.fitting.combined import BoundedMutual
 from orthocas.fitting.terms import Weights
 from orthocas.solvers.protocol import SolveResult, Status
 from orthocas.tasks.samples import sample_problem

@@ -108,6 +108,16 @@ def test_a_tracker_in_free_space_is_the_plain_one(arm: tuple[oc.Robot, oc.Chart]
         assert kept.status == plain.status
 
 
+def test_a_model_without_pairs_stops_nothing() -> None:
+    """The rods of a planar arm are all neighbours: the distance of no pair is infinite, and no contact."""
+    rods = oc.Robot.planar([1.0, 1.0, 1.0], [1.0, 1.0, 1.0]).with_rods(0.01)
+    task = oc.Task.position(rods, axes="xy")
+    chart = oc.fit(oc.Problem(rods, task, "euclidean", oc.Box(HOME, 0.4)), oc.Linear(), samples=300).chart
+    assert np.isinf(rods.collisions.distance(HOME).distance)
+    free, reach = chart.xi_range(HOME), chart.xi_range(HOME, rods.collisions)
+    np.testing.assert_allclose([reach.low, reach.high], [free.low, free.high], atol=1e-8)
+
+
 @pytest.mark.slow
 def test_hostile_streams_touch_nothing(arm: tuple[oc.Robot, oc.Chart]) -> None:
     robot, chart = arm

@@ -9,9 +9,9 @@ from programs import needs_c, nightly
 from public_objects import wide
 
 import orthocas as oc
-from orthocas.charts import motion_kernel
+from orthocas.charts import curve_tracer
+from orthocas.charts.curve_tracer import SearchKernel
 from orthocas.charts.curves import SelfMotionCurves
-from orthocas.charts.motion_kernel import SearchKernel
 from orthocas.tasks.samples import sample_uniform
 
 FOUND, NEAREST = oc.InverseStatus.FOUND, oc.InverseStatus.NEAREST
@@ -192,7 +192,7 @@ def test_ends_and_turns_beyond_the_room_of_c_count_as_well(monkeypatch: pytest.M
     curves = chart.parts.inverse.curves
     assert curves is not None
     roomy = curves.search(phi, wishes, 1e-9)
-    source = motion_kernel.get_source
+    source = curve_tracer.get_source
 
     def get_narrow(name: str) -> str:
         text = source(name)
@@ -201,7 +201,7 @@ def test_ends_and_turns_beyond_the_room_of_c_count_as_well(monkeypatch: pytest.M
             text = text.replace(f"#define {word} {room}\n", f"#define {word} 1\n")
         return text
 
-    monkeypatch.setattr(motion_kernel, "get_source", get_narrow)
+    monkeypatch.setattr(curve_tracer, "get_source", get_narrow)
     narrow = replace(curves, kernel=SearchKernel(chart)).search(phi, wishes, 1e-9)
     assert np.unique(roomy.distance > 0).size == 2
     np.testing.assert_allclose(narrow.distance, roomy.distance, atol=2e-10)

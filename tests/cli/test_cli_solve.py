@@ -47,7 +47,7 @@ def test_bad_input_is_one_sentence(run: Run, arm_file: Path) -> None:
     for words, part in (
         (["solve", str(arm_file), "--x", "1"], "2 numbers"),
         (["solve", str(arm_file), "--x", "1,1", "--all"], "--all requires --xi"),
-        (["solve", "panda-wide", "--x", "0,0,0,0,0,0", "--branch", "elbow+"], "an arm file"),
+        (["solve", "panda-wide", "--x", "0,0,0,0,0,0", "--all"], "an arm file"),
         (["evaluate", str(arm_file)], "oc.Arm.load and orthocas solve"),
         (["fit", "planar_3r_xy", "--domain", "all", "--param", "linear"], "leave out --param"),
     ):

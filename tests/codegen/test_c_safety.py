@@ -141,6 +141,7 @@ def test_valgrind_finds_nothing(pd_plus: Generated, tmp_path: Path) -> None:
     assert done.returncode == 0, done.stderr[-2000:]
 
 
+@pytest.mark.nightly
 def test_calls_take_no_more_stack_than_the_header_says(arm_chart: oc.Chart, clang: str, tmp_path: Path) -> None:
     """Measured on a painted stack, for what needs most, by gcc without optimisation and clang with it."""
     solver = oc.solvers.LBFGS(max_iterations=1)

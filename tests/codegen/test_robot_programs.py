@@ -17,7 +17,7 @@ from orthocas.fitting.fit import Fit
 mujoco = pytest.importorskip("mujoco", minversion="4", reason="the extra orthocas[mujoco] is not installed")
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @needs_c
 @needs_cmake
 @pytest.mark.usefixtures("unoptimised")

@@ -96,7 +96,7 @@ def test_every_family_is_near_its_python(planar_xy: oc.Problem, parametrisation:
     assert max(check_c(generated, chart, law, states=200).differences.values()) < 1e-4
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_seven_joints_and_a_pose(iiwa: oc.Problem, tmp_path: Path) -> None:
     box = oc.Box(iiwa.domain.centre, 0.4)  # far from half turns, where orientations lose digits
     pose = oc.Problem(iiwa.robot, oc.Task.pose(iiwa.robot), domain=box, least_singular_value=0.03)

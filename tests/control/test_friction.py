@@ -56,7 +56,7 @@ def test_joints_that_stick_leave_x_and_xi_within_half_a_millimetre_and_0_02(char
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("change", ["payload", *nightly("masses")])
+@pytest.mark.parametrize("change", nightly("payload", "masses"))
 def test_unknown_loads_leave_less_than_a_millimetre(chart: oc.Chart, change: str) -> None:
     """3 kg, and masses that are 40 % off, without friction."""
     robot = chart.problem.robot

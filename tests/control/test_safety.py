@@ -112,6 +112,7 @@ def test_the_observer_keeps_torques_of_coarse_encoders_below_their_rate() -> Non
     assert not any(case.caught for case in found)
 
 
+@pytest.mark.nightly
 def test_gains_for_a_delay_settle_an_arm_that_default_ones_make_swing() -> None:
     """Ten milliseconds on an arm that nothing was tuned for, from its fastest posture and others."""
     chart = oc.charts.load("ur5-position")

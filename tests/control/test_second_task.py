@@ -296,7 +296,7 @@ def test_grown_charts_are_refused_with_a_way_out(planar_x: oc.Problem) -> None:
 
 
 @needs_c
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_generated_c_equals_python(planar_chart: oc.Chart, tmp_path: Path) -> None:
     """Also NaN, infinities and huge numbers: same status, same fallback."""
     problem = planar_chart.problem

@@ -37,7 +37,7 @@ def test_no_load_at_the_tip_makes_a_gradient_that_is_orthogonal_to_a_pose_lean()
         assert lean(heavy, across, J[:3], q) > 1e-4
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @needs_c
 def test_decoupled_law_in_c_takes_a_wide_network_with_the_inertia_metric(tmp_path: Path) -> None:
     """Without a warning, which would be an error here."""

@@ -44,7 +44,7 @@ def test_batched_flow_stops_where_the_solution_ends() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("metric", [*nightly("euclidean"), "inertia", STIFFNESS], ids=["I", "M", "custom"])
+@pytest.mark.parametrize("metric", [*nightly("euclidean"), "inertia", *nightly(STIFFNESS)], ids=["I", "M", "custom"])
 def test_pull_ends_where_the_paper_s_gradient_flow_ends(metric: object) -> None:
     """Equation (23) by SciPy, run until h has converged to 1e-9, against the task-parametrised flow."""
     problem = planar(metric)

@@ -297,7 +297,7 @@ def test_batches_share_out_what_is_left_of_dropped_samples() -> None:
         parts = list(objective.batches(20, 4, (seed,)))
         assert len(parts) == 4
         assert all(np.isfinite(part.value(theta)) for part in parts)
-    assert set(objective._graphs.built) <= {20, len(sample_problem(problem, 64, 1))}
+    assert {columns for _, columns in objective._graphs} <= {20, len(sample_problem(problem, 64, 1))}
 
 
 def test_weights_of_a_command_line_have_terms_by_name() -> None:

@@ -7,7 +7,7 @@ import casadi as ca
 import numpy as np
 import pytest
 from conftest import robot_of
-from programs import Run, nightly
+from programs import Run
 from public_objects import suggestion
 
 import orthocas as oc
@@ -190,8 +190,8 @@ def test_progress_is_reported_and_ctrl_c_ends_the_search() -> None:
     assert 0 < seen[0].fraction < seen[2].fraction < 1
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize("joints", [6, *nightly(10)])
+@pytest.mark.nightly
+@pytest.mark.parametrize("joints", [6, 10])
 def test_progress_rises_to_the_end_of_the_search_and_waits_nowhere(joints: int) -> None:
     seen: list[Progress] = []
     robot = oc.Robot.planar([3.0 / joints] * joints, [1.0] * joints)
@@ -208,7 +208,7 @@ def test_progress_rises_to_the_end_of_the_search_and_waits_nowhere(joints: int) 
     assert np.abs(fractions - np.arange(1, len(fractions) + 1) / len(fractions)).max() < 0.35
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_boxes_of_light_wrists_do_not_depend_on_the_luck_of_single_trials() -> None:
     """With a start of its own for every trial, the box of the ur10 with A = M had a mean half-width of 0.21 rad."""
     robot = robot_of("ur10")
@@ -247,7 +247,7 @@ def family_of(problem: oc.Problem, widths: object) -> object:
     return oc.Polynomial(2).family(JointSpace.of(dataclasses.replace(problem, domain=box)), 6)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_many_joints_get_a_box_without_folds() -> None:
     """Judged by determinants in corners, with other samples, by other code."""
     robot = oc.Robot.planar([0.3] * 9, [1.0] * 9)

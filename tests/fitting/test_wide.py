@@ -39,10 +39,10 @@ from orthocas.errors import (
 )
 from orthocas.fitting import wide as wide_fits
 from orthocas.fitting.basis_objective import BasisObjective, build_gradients
+from orthocas.fitting.combined import Resampled
 from orthocas.fitting.like import Like, QuadraticTerm
 from orthocas.fitting.network_objective import ArrayObjective
 from orthocas.fitting.sample_loss import Loss, build_sample_loss
-from orthocas.fitting.stages import Resampled
 from orthocas.fitting.terms import Sizes
 from orthocas.fitting.wide import WideFit, _build_problems, _describe_left_out, _fit_most
 from orthocas.fitting.wide_search import Search, WideSettings, sample_frames, search_families
@@ -312,7 +312,7 @@ def test_a_hand_that_rolls_moves_no_other_joint_and_closes_its_turns() -> None:
     np.testing.assert_array_equal(chart.coordinates.jacobian(q)[:, 0, 6], 0.0)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_coordinates_without_the_roll_are_tried_first(tmp_path: Path) -> None:
     fit = oc.fit_wide(iiwa(), oc.Task.pose(iiwa()), home_branch(), samples=10_000)
     assert fit.chart.coordinates.label == "mlp:24x24x24:raw:isru:without=A7"
@@ -427,7 +427,7 @@ def test_the_printed_share_is_of_the_branch(centre: list[float], small: bool) ->
             assert _fit_most((whole, smaller), Shares(*shares)).regular_share == kept
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_branches_say_which_of_them_the_usual_clearance_cannot_serve() -> None:
     robot = oc.Robot.from_urdf(
         robot_data("tiago_description/robots/tiago_dual.urdf"), "arm_left_tool_link", {"torso_lift_joint": 0.1}
@@ -767,7 +767,7 @@ def test_laws_stop_where_coordinates_end() -> None:
 
 
 @needs_c
-@pytest.mark.slow
+@pytest.mark.nightly
 @pytest.mark.usefixtures("blank_pictures")
 def test_the_whole_inertia_follows_in_mujoco(run: Run, tmp_path: Path) -> None:
     wide_pose().chart.save(tmp_path / "wide.orthocas")
@@ -819,7 +819,7 @@ def test_command_fits_a_branch(run: Run) -> None:
     assert run("fit", "iiwa", "--branch", "up")[::2] == (2, message)
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_command_weighs_the_terms_of_a_wide_fit(run: Run) -> None:
     """Numbers are weights of leaks in the metric; terms by name join the weights that wide fits have of their own."""
     words = ("fit", "planar_3r_xy", "--metric", "euclidean", "--domain", "branch", "--param", "polynomial:3")
@@ -934,7 +934,7 @@ def test_networks_are_regular_on_a_whole_box() -> None:
     assert 0.3 < stopped.value.result.regular_share <= 1
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_networks_in_another_metric_begin_with_those_of_the_identity() -> None:
     known = oc.problems.get("planar_3r_xy")
     network = oc.MLP((8,), raw=True)
@@ -1154,7 +1154,7 @@ def test_nearly_all_of_a_branch_is_proved_and_holds() -> None:
     assert (np.trace(far, axis1=1, axis2=2) < 2 * np.cos(3.1) + 1).any()  # half a turn is no boundary of the proof
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_cuts_of_two_arms_are_those_of_each() -> None:
     """The last seven joints of a robot with two tips carry one of them only."""
     path = robot_data("baxter_description/urdf/baxter.urdf")

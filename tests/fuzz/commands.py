@@ -57,18 +57,16 @@ _VALUES: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("--lock",), ("j1=0", "j1", "=", "j1=nan", "j1=x", "nowhere=1", "l1=0=1", "j1=1e300")),
     **dict.fromkeys(("--tool", "--payload", "--centre", "--half-width", "--weights", "--friction", "--noise"), _LISTS),
     **dict.fromkeys(("--stiffness", "--damping-ratio", "--feedback", "--limit"), _LISTS),
-    "--damping-stiffness": _LISTS,
     "--model": ("own", "given", "", "x"),
     "--gravity-compensation": ("law", "robot", "", "9.81"),
     "--inputs": ("payload", "payload,wrench,extra_torque", "payload,payload", ",", "", "mass"),
     **dict.fromkeys(("--bound", "--seconds"), (*NUMBERS, "0.1")),
     "--workers": ("0", "-1", "1", "1.5", "", "tcp:/", "x://"),
-    **dict.fromkeys(("--seed", "--seeds", "--samples", "--held-out", "--jobs"), _COUNTS),
-    **dict.fromkeys(("--rate", "--mass-factor", "--max-mutual-deg"), (*NUMBERS, "50", "10")),
+    **dict.fromkeys(("--seed", "--seeds", "--samples", "--jobs"), _COUNTS),
+    **dict.fromkeys(("--rate", "--mass-factor"), (*NUMBERS, "50", "10")),
     **dict.fromkeys(("--period", "--link-radius", "--clearance"), (*NUMBERS, "0.01")),
-    "--collisions": ("arm.urdf", "nothing.urdf", "", "panda", "chart.orthocas"),
-    "--srdf": ("arm.srdf", "", "arm.urdf"),
-    **dict.fromkeys(("--start", "--velocity-limit", "--acceleration-limit"), _LISTS),
+    "--collisions": ("arm.urdf", "arm.urdf,arm.srdf", ",", "nothing.urdf", "", "panda", "chart.orthocas,arm.urdf"),
+    **dict.fromkeys(("--start", "--velocity-limit"), _LISTS),
     "--obstacle": (
         "",
         "sphere:",
@@ -95,12 +93,10 @@ _VALUES: dict[str, tuple[str, ...]] = {
     "--plant": ("mujoco", "cvodes", "MuJoCo", ""),
     "--steps": _FILES,
     **dict.fromkeys(("--export",), ("page.html", "", ".", "/dev/null/x", "chart.orthocas")),
-    "--host": ("203.0.113.7", "", "nowhere", "::2"),
-    "--port": ("0", "-1", "99999", "1.5", ""),
+    "--port": ("0", "-1", "99999", "1.5", "", "203.0.113.7:0", "nowhere:0", "[::2]:0", ":0", "a:b"),
     "--path": _FILES,
     "--robot": ("arm.urdf", "nothing.urdf", "chart.orthocas"),
     "--x": ("0.9", "0.9,0.1", "", "a", "nan", "1e400", "0.9,"),
-    "--branch": ("any", "shoulder+", ""),
     "--to": ("numpy", "torch", "jax", "", "tensorflow"),
     "--name": ("arm", "int", "1arm", "a b", "math", "é", "x" * 200, "main"),
 }
@@ -108,24 +104,16 @@ _KEPT = ("--export",)  # without it, the command serves until Ctrl-C
 _PROBLEM_OPTIONS = ("--tip", "--lock", "--tool", "--payload")
 _DOMAIN_OPTIONS = ("--task", "--metric", "--centre", "--home", "--half-width")
 _AUTO_OPTIONS = ("--domain", "--leak-deg", "--conditioning")
-_LAW_OPTIONS = (
-    "--stiffness",
-    "--damping-ratio",
-    "--coupling",
-    "--damping",
-    "--feedback",
-    "--limit",
-    "--damping-stiffness",
-)
-_RUN_OPTIONS = ("--rate", "--mass-factor", "--friction", "--noise", "--seed", "--plant")
-_SOLIDS = ("--collisions", "--srdf")
+_LAW_OPTIONS = ("--stiffness", "--damping-ratio", "--coupling", "--damping", "--feedback", "--limit")
+_RUN_OPTIONS = ("--rate", "--mass-factor", "--friction", "--noise", "--plant")
+_SOLIDS = ("--collisions",)
 _COMMANDS: dict[str, tuple[tuple[str, ...], dict[str, str], tuple[str, ...]]] = {  # targets, options, other options
     "fit": (
         _PROBLEMS,
         {"--param": "polynomial:1", "--samples": "30", "--out": "new.orthocas"},
         (
             *(*_PROBLEM_OPTIONS, *_DOMAIN_OPTIONS, *_AUTO_OPTIONS),
-            *("--solver", "--seed", "--weights", "--max-mutual-deg"),
+            *("--solver", "--seed", "--weights"),
         ),
     ),
     "fit --domain auto": (
@@ -151,11 +139,11 @@ _COMMANDS: dict[str, tuple[tuple[str, ...], dict[str, str], tuple[str, ...]]] = 
     "info --branches": ((*_PROBLEMS, *_FILES), {}, (*_PROBLEM_OPTIONS, "--task")),
     "certify": (_FILES, {"--seconds": "0.5", "--out": "new.orthocas"}, ("--bound", "--workers")),
     "demo": (("", *_PROBLEMS), {"--out": "out"}, ()),  # takes no word, so this is refused before it fits
-    "evaluate": (_FILES, {"--samples": "50"}, ("--seed", *_SOLIDS)),
-    "info": ((*_PROBLEMS, *_FILES), {}, (*_PROBLEM_OPTIONS, *_SOLIDS)),
+    "evaluate": (_FILES, {"--samples": "50"}, _SOLIDS),
+    "info": ((*_PROBLEMS, *_FILES), {}, ("--tip", "--lock", *_SOLIDS)),
     "compare": (
         _PROBLEMS,
-        {"--param": "polynomial:1", "--samples": "30", "--held-out": "50", "--jobs": "0"},
+        {"--param": "polynomial:1", "--samples": "30", "--jobs": "0"},
         ("--solver", "--seeds", "--weights", "--domain", "--out"),
     ),
     "simulate": (
@@ -165,20 +153,20 @@ _COMMANDS: dict[str, tuple[tuple[str, ...], dict[str, str], tuple[str, ...]]] = 
     ),
     "doctor": (("", "chart.orthocas"), {}, ("--out",)),
     "charts": (("ur5-position", "ur5", "chart.orthocas", ""), {}, ("--out",)),
-    "solve": (_FILES, {"--x": "0.9"}, ("--xi", "--start", "--branch")),
+    "solve": (_FILES, {"--x": "0.9"}, ("--xi", "--start")),
     "export": (_FILES, {"--to": "numpy", "--out": "module.py"}, ()),
     "follow": (
         _FILES,
         {"--out": "q.csv", "--velocity-limit": "1", "--period": "0.05"},
         (
-            *("--xi", "--start", "--acceleration-limit", "--obstacle"),
+            *("--xi", "--obstacle"),
             *("--link-radius", "--clearance", *_SOLIDS),
         ),
     ),
     "view": (
         (*_FILES, "q.csv"),
         {"--export": "page.html"},
-        ("--chart", "--path", "--robot", "--host", "--port", "--tip", "--lock", *_SOLIDS),
+        ("--chart", "--path", "--robot", "--port", "--tip", "--lock", *_SOLIDS),
     ),
     "codegen": (
         _FILES,

@@ -11,7 +11,7 @@ from public_objects import joint_motion, planar
 from fuzz.child import Finding, run
 from fuzz.mutants import TEXTS, Rng, flipped, pick
 from fuzz.sealed_files import judged
-from orthocas.paths.recordings import read_joints
+from orthocas.paths.joint_motion import read_joints
 from orthocas.viewer.motion import read_joint_motion
 
 _CELLS = ("0", "nan", "-1e999", "1e300", "", " ", "a", '"1"', '"1', "1_0", "0x10", "time_s", "q1", "d_q1", *TEXTS)

@@ -50,7 +50,7 @@ _STEPS = {"duration": 1.0, "steps": [{"time": 0.1, "move": {"x": 0.05}}]}
 _CONTROLLED = ("--controller", "pd_plus", "--out", "out")
 _PATH = "x\n0.85\n0.9\n0.95\n0.9\n0.85\n"
 _CHOSEN = ("--xi", "objective", "--velocity-limit", "0.2", "--period", "0.002")
-_SMALL_GRID = ("--param", "linear", "--param", "polynomial:2", "--jobs", "2", "--held-out", "500", "--samples", "200")
+_SMALL_GRID = ("--param", "linear", "--param", "polynomial:2", "--jobs", "2", "--samples", "200")
 COMMANDS: dict[str, tuple[str, ...]] = {  #: words after `orthocas`; the loop is a program of a user
     "info": ("info", "planar_3r_x"),
     "fit": ("fit", "planar_3r_x", "--param", "polynomial:4", "--samples", "2000", "--out", "out/c.orthocas", "--json"),

@@ -178,7 +178,7 @@ def circle(imports: Mapping[str, Collection[str]]) -> list[str]:
 
 def test_there_are_sources_to_check() -> None:
     assert len(SOURCES) > 100
-    assert {"orthocas.problems", "orthocas.solvers.gauss_newton", "orthocas.fitting.terms"} <= set(MODULES)
+    assert {"orthocas.problems", "orthocas.solvers.minimisers", "orthocas.fitting.terms"} <= set(MODULES)
     assert "orthocas.tools.checks" in imports_of(MODULES["orthocas.charts.chart"])
     assert "orthocas.charts.figures" in imports_of(MODULES["orthocas.charts.chart"], inside=True)
     assert {package(name) for name in MODULES if name not in (*FACES, "orthocas")} == set(ORDER)

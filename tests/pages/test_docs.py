@@ -29,7 +29,7 @@ def test_python_quickstart_runs(tmp_path: Path) -> None:
     assert (tmp_path / "arm.png").exists()
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_newcomers_path_from_a_urdf_to_c_runs(run: Run) -> None:
     """Every command of the README after the one that installs, in an empty folder; ten are enough."""
     install, commands, _ = (block.splitlines() for block in blocks("sh"))

@@ -12,7 +12,7 @@ import pytest
 
 import orthocas
 from orthocas import bases, codegen, control, simulation, solvers
-from orthocas.bases import registry as families
+from orthocas.bases import family as families
 from orthocas.fitting import terms as loss_terms
 from orthocas.tools.cached import cached_property
 

@@ -369,7 +369,7 @@ def test_benchmark_of_collisions_agrees_with_mujoco() -> None:
     assert found["panda, URDF, apart [m]"] < 1e-7
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_benchmark_of_random_walks_breaks_no_limit() -> None:
     found = random_walk.main(quick=True)
     assert found["one arm, beyond joint limits"] == 0

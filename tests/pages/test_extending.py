@@ -108,7 +108,7 @@ def test_symbolic_loss_is_minimised_by_ipopt(tmp_path: Path) -> None:
     assert found < 0.1 * start
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 @needs_c
 def test_law_brakes_and_becomes_c(tmp_path: Path) -> None:
     more = """

@@ -8,6 +8,7 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+from browser import PROGRAM, browser
 
 import orthocas
 
@@ -100,3 +101,33 @@ def test_pages_are_short(name: str) -> None:
 def test_the_navigation_has_about_thirty_pages() -> None:
     """Of two levels; other pages stand below one of these."""
     assert 25 <= len(contents("index")) <= 36
+
+
+SITE = DOCS.parent / "build" / "docs"
+WIDTHS = (360, 600, 760, 860, 920, 1010, 1178, 1440, 1920)  #: of windows [px]; side bars appear in between
+#: what ends right of the window, or of its own column, without a bar to scroll it
+CUT = """(() => {
+  const scrolls = e => e && (/auto|scroll/.test(getComputedStyle(e).overflowX) || scrolls(e.parentElement));
+  const cut = e => e.right > innerWidth + 1 || e.left < -1 || e.right > column.right + 1;
+  const article = document.querySelector('article'), column = article.closest('.content').getBoundingClientRect();
+  const parts = [...article.querySelectorAll('p, li, h1, h2, h3, dt, dd, pre, table, img, .math')];
+  const found = parts.filter(e => e.offsetWidth && cut(e.getBoundingClientRect()) && !scrolls(e));
+  return found.map(e => e.tagName + ' ' + e.textContent.slice(0, 40));
+})()"""
+
+
+@pytest.mark.nightly
+@pytest.mark.skipif(PROGRAM is None, reason="no chromium: apt-get install chromium")
+@pytest.mark.skipif(not (SITE / "genindex.html").exists(), reason="no site: make docs")
+def test_no_page_is_cut_at_any_width(tmp_path: Path) -> None:
+    cut = {}
+    with browser(tmp_path) as page:
+        for name in PAGES:
+            page.open((SITE / f"{name}.html").as_uri())
+            page.wait("document.readyState === 'complete' && !!document.querySelector('article')")
+            for width in WIDTHS:
+                size = {"width": width, "height": 900, "deviceScaleFactor": 1, "mobile": False}
+                page.call("Emulation.setDeviceMetricsOverride", **size)
+                if found := page.value(CUT):
+                    cut[name, width] = found[0]
+    assert cut == {}

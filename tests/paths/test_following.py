@@ -18,11 +18,11 @@ import orthocas as oc
 from orthocas import problems
 from orthocas.errors import InvalidValueError, NoExpressionError, PathError, PathFileError, ShapeError
 from orthocas.paths import JointMotion
-from orthocas.paths.follow import Costs, MotionLimits, XiChoice, walk
+from orthocas.paths.follow import MotionLimits
 from orthocas.paths.joint_curve import JointCurve, PhiSolver
 from orthocas.paths.tool_path import RULES as PATH_RULES
 from orthocas.paths.tool_path import ToolPath
-from orthocas.paths.xi_search import XiSearch
+from orthocas.paths.xi_search import Costs, XiChoice, XiSearch, walk
 from orthocas.robots.collisions import Collisions
 from orthocas.robots.obstacles import Sphere
 from orthocas.tools.checks import Array

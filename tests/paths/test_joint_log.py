@@ -52,7 +52,8 @@ def test_what_follow_writes_is_drawn_as_a_log(chart: oc.Chart, run_paper: Run) -
     oc.follow(chart, circle, velocity_limits=1.0).save_csv("joints.csv")
     chart.save("arm.orthocas")
     code, out, err = run_paper("fig28", "--log", "joints.csv", "--chart", "arm.orthocas", "--out", "new")
-    assert (code, err) == (0, "")
+    # a slow machine notes every ten seconds how far it is
+    assert (code, [line for line in err.splitlines() if not line.startswith("note: ")]) == (0, [])
     numbers = {line.split()[0]: float(line.split()[1]) for line in out.splitlines() if line.startswith("  ")}
     assert numbers["difference_of_end_and_start_xi1"] < 1e-9
     assert numbers["joint_difference_of_end_and_start_rad"] < 1e-8

@@ -9,8 +9,9 @@ import pytest
 
 import orthocas as oc
 from orthocas import problems
-from orthocas.charts.self_motion import Interval, Stop
+from orthocas.charts.self_motion import Interval
 from orthocas.charts.trackers import RULES, TrackerStatus
+from orthocas.charts.walls import Stop
 from orthocas.errors import DomainError
 from orthocas.tasks.corridor import Corridor
 from orthocas.tasks.domains import StopKind

@@ -67,3 +67,24 @@ def test_planar_arm_bends_its_joints() -> None:
     robot = oc.Robot.planar([1.0, 1.0, 1.0], [1.0, 1.0, 1.0])
     centre = regular_box(robot, oc.Task.position(robot, "xy")).centre
     assert np.abs(centre[1:]).max() > 0.7
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["so100", "so101"])
+def test_arms_of_hobbyists_fit_without_folds_on_their_default_domain(name: str) -> None:
+    """Their boxes hold near-singular positions, so the default is the clear part; judged at own samples."""
+    robot = oc.Robot.from_name(name)
+    problem = oc.Problem(robot, oc.Task.position(robot))
+    box = regular_box(robot, problem.task)
+    low, high = problem.domain.bounds
+    points = np.random.default_rng(7).uniform(low, high, (20_000, robot.n))
+    J = robot.jacobian(points)[:, :3]
+    condition = np.linalg.svd(J, compute_uv=False)
+    inside = problem.domain.contains(points)
+    np.testing.assert_array_equal(problem.domain.centre, box.centre)
+    assert 0.85 < inside.mean() < 1
+    assert condition[inside, 2].min() > 3 * condition[:, 2].min()
+    fit = oc.fit(problem)
+    assert fit.worst is not None
+    assert fit.worst.least > 0.3
+    assert oc.evaluate(fit.chart, 20_000, 1).folded_samples == 0

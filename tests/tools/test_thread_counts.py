@@ -192,7 +192,7 @@ def test_a_forked_process_starts_threads_of_its_own() -> None:
     assert subprocess.run([sys.executable, "-c", FORKED], check=False, timeout=60).returncode == 0
 
 
-@pytest.mark.slow
+@pytest.mark.nightly
 def test_processes_with_one_and_two_threads_find_the_same(tmp_path: Path) -> None:
     """Whole processes, BLAS and all, to 1e-12: rounding in single precision would show at 1e-5."""
     for count in ("1", "2"):

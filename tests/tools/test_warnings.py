@@ -11,7 +11,7 @@ def warn(category: type[Warning], module: str) -> None:
     warnings.warn_explicit("told by a test", category, "file.py", 1, module)
 
 
-@pytest.mark.parametrize("module", ["orthocas.charts.chart", "orthocas.solvers.lbfgs", "test_chart", "conftest"])
+@pytest.mark.parametrize("module", ["orthocas.charts.chart", "orthocas.solvers.minimisers", "test_chart", "conftest"])
 def test_announcements_to_us_are_errors(module: str) -> None:
     for category in ANNOUNCEMENTS:
         with pytest.raises(category):

@@ -19,7 +19,7 @@ from test_view_pages import wait
 
 import orthocas as oc
 from orthocas.viewer import View
-from orthocas.viewer.player import RobotPage
+from orthocas.viewer.view import RobotPage
 from orthocas.viewer.window import _CAMERA_NUMBERS
 
 pytestmark = pytest.mark.skipif(find_spec("viser") is None, reason="no viser: pip install 'orthocas[view]'")

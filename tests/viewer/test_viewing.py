@@ -20,8 +20,8 @@ from orthocas.errors import InvalidValueError, MissingExtraError, NoExpressionEr
 from orthocas.tools import checks
 from orthocas.viewer import Motion, export_page, window
 from orthocas.viewer.panel import ChartPanel, PlayerPanel, RobotPanel, format_drift
-from orthocas.viewer.player import PlayerPage
 from orthocas.viewer.session import Session
+from orthocas.viewer.view import PlayerPage
 from orthocas.viewer.window import Loop, is_local
 
 
@@ -195,7 +195,7 @@ def test_what_cannot_be_shown_is_refused(shown: object, error: type[Exception], 
     [
         (["nothing.orthocas"], "nothing.orthocas"),
         (["a.orthocas", "--port", "99999"], "port is 99999, expected"),
-        (["a.orthocas", "--host", "203.0.113.7"], "expected an address of this machine"),
+        (["a.orthocas", "--port", "203.0.113.7:0"], "expected an address of this machine"),
         (["a.orthocas", "--path", "p.csv", "--export", "page.html"], "--path is for live pages of charts"),
         (["iiwa", "--path", "p.csv"], "--path is for live pages of charts"),
         (["q.csv"], "give --chart or --robot"),

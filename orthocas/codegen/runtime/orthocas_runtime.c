@@ -37,7 +37,7 @@ static const struct {
   .standing = 0.1,           /* share of its velocity by which a reference that stands still may move */
   .room = 0.05,              /* how far inside the return margin the arm is brought: clearly inside [half-widths] */
   .nearly = 0.2,             /* of the rest speed: the law takes over at the end of the way back, at rest */
-  .slow = 1.0 / 3.0,         /* share of the speed limit of a joint on the way back */
+  .slow = 1.0 / 3.0,         /* share of the speed limit of a joint on the way back, and as a law takes over */
   .settling = 0.5,           /* time constant with which the last part of the offset fades [s] */
   .giving = 0.02,            /* share of the spring or load that a fast arm takes away in a tick */
   .learning = 2.0,           /* rate at which the load is learned, slower than the catcher's modes [1/s] */
@@ -773,8 +773,7 @@ static int works(int law) { return law == ORTHOCAS_OK || law == ORTHOCAS_SATURAT
  * the torque that drives them is taken back, which takes time by command_rate. */
 static int hurries(const orthocas_arm *arm, orthocas_state *state, double period) {
   const orthocas_safety *safety = state->safety;
-  const double *dq = state->dq;
-  const double rate = fmin(rules.trend, 1.0 / period);
+  const double *dq = state->dq, rate = fmin(rules.trend, 1.0 / period);
   double until = 0.0;
   int hurry = faster_than(arm, dq, safety->speed_limit, 1.0);
   for (int i = 0; i < arm->n && arm->torque; ++i)
@@ -830,7 +829,8 @@ static void choose_mode(const orthocas_arm *arm, orthocas_state *state, int law,
   if (state->mode == ORTHOCAS_HOLD) copy(state->anchor, state->q, arm->n);
   if (state->mode == ORTHOCAS_RETURN && (fast || touch))
     catch_arm(arm, state, fast ? ORTHOCAS_TOO_FAST : ORTHOCAS_TOUCHED);
-  if (state->asked && !late && !touch && !faster_than(arm, state->dq, safety->rest_speed, 1.0)) {
+  if (state->asked && !late && !touch && !faster_than(arm, state->dq, safety->rest_speed, 1.0) &&
+      !faster_than(arm, state->dq, safety->speed_limit, rules.slow)) {
     if (!ready) state->mode = ORTHOCAS_RETURN;
     else if (state->mode != ORTHOCAS_RETURN || !faster_than(arm, state->dq, safety->rest_speed, rules.nearly))
       release_arm(arm, state, error);

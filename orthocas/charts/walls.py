@@ -1,4 +1,4 @@
-"""Clearance of streams of postures: what trackers ask of a collision model at each call."""
+"""What stops a motion: the boundaries of a domain and contacts, and what trackers keep clear of."""
 
 from __future__ import annotations
 
@@ -9,12 +9,15 @@ import numpy as np
 from orthocas.errors import InvalidValueError
 from orthocas.robots.collisions import Collisions
 from orthocas.robots.tree import KinematicTree
+from orthocas.tasks.domains import StopKind, Wall
+from orthocas.tasks.problem import Problem
 from orthocas.tools.checks import Array, Indices, as_number, require_kind
+from orthocas.tools.expressions import wrap_shortest
 
 
 @dataclass(frozen=True, slots=True)
 class ClearanceRules:
-    """Numbers of trackers that keep clear of contacts."""
+    """Numbers of walls, and of trackers that keep clear of contacts."""
 
     margin: float = 0.01  #: [m], default of the distance that is kept
     largest: float = 10.0  #: [m], of distances to keep
@@ -26,9 +29,129 @@ class ClearanceRules:
     sweeps: int = 8  #: over the pairs, of a projection onto what they allow
     movable: float = 1e-3  #: [m per unit of xi], of pairs that xi can move
     settled: float = 1e-6  #: of xi, relative to the wished change: the search has ended
+    at_limit: float = 1e-9  #: half-widths: boundaries closer to a joint limit are that limit
+    grazing: float = 1e-4  #: [rad] or [m]: shorter steps are not checked for contacts between their ends
+    depth: float = 1e-4  #: [m] of contacts that may be passed between two steps
 
 
 RULES = ClearanceRules()
+
+
+def require_collisions(collisions: object, tree: KinematicTree) -> None:
+    """Raise InvalidValueError for what is neither None nor a collision model of the robot of a tree."""
+    if collisions is not None:
+        require_kind("collisions", collisions, Collisions)
+        assert isinstance(collisions, Collisions)
+        collisions.require_for(tree)
+
+
+@dataclass(frozen=True)
+class Stop:
+    """What ends a motion, and where."""
+
+    kind: StopKind
+    joint: str = ""  #: name of the joint, for JOINT
+    value: float = np.nan  #: position of that joint [rad] or [m], or what a condition of the domain bounds
+    is_limit: bool = False  #: whether the boundary of the domain is the limit of the joint
+    condition: str = ""  #: in one line, for conditions of the domain; the pair, for contacts
+
+    def __str__(self) -> str:
+        if self.kind is StopKind.JOINT:
+            return f"joint '{self.joint}' at {self.value:.4g}{', its limit' if self.is_limit else ''}"
+        if self.kind is StopKind.NEAR_SINGULAR:
+            return f"the task near singular, with a relative singular value of {self.value:.3g}"
+        if self.kind is StopKind.CONDITION:
+            return f"the boundary of the domain ({self.condition})"
+        if self.kind is StopKind.CONTACT:
+            return f"a contact of {self.condition}"
+        return {
+            StopKind.FOLD: "a fold of the chart",
+            StopKind.SINGULAR: "a singularity or the end of the chart",
+            StopKind.ENDLESS: "nothing",
+        }[self.kind]
+
+    @property
+    def brief(self) -> str:
+        """The same in a few words."""
+        if self.kind is StopKind.JOINT:
+            return f"{self.joint} at {'its limit ' if self.is_limit else ''}{self.value:.4g}"
+        return {
+            StopKind.NEAR_SINGULAR: "the task near singular",
+            StopKind.CONDITION: self.condition,
+            StopKind.CONTACT: f"a contact of {self.condition}",
+            StopKind.FOLD: "a fold",
+            StopKind.SINGULAR: "a singularity",
+            StopKind.ENDLESS: "no end",
+        }[self.kind]
+
+
+class Walls:
+    """The boundaries of a problem's domain as functions that are positive inside.
+
+    They are (q_i - low_i) and (high_i - q_i), divided by the half-width of the domain, for every joint; then what the
+    domain itself names as its `walls`; then the distance to a contact, if there are solids to hit.
+    """
+
+    def __init__(self, problem: Problem, collisions: Collisions | None = None) -> None:
+        domain = problem.domain
+        self._domain, self._robot, self._collisions = domain, problem.robot, collisions
+        self._low, self._high = domain.bounds
+        self.solid = collisions is not None  #: whether there is something to hit
+        self._curved = domain.walls
+        require_collisions(collisions, problem.robot.tree)
+        if collisions is not None:
+            self._curved = (*domain.walls, Wall(StopKind.CONTACT, lambda q: float(collisions.distance(q).distance)))
+        endless = np.isinf(self._low) & ~np.array(problem.robot.tree.prismatic)
+        self.turning = endless  #: unbounded revolute joints, (n,): they are at the same place after a full turn
+
+    def values(self, q: Array) -> Array:
+        """All functions at one joint position (n,), positive inside; infinite for unbounded joints."""
+        width = self._domain.half_width
+        rooms = np.array([wall.room(q) for wall in self._curved])
+        parts = [
+            (q - self._low) / width,
+            (self._high - q) / width,
+            np.where(np.isfinite(rooms) | (rooms > 0), rooms, -1.0),
+        ]
+        return np.concatenate(parts)
+
+    def box_has(self, q: Array) -> bool:
+        """Whether q (n,) lies in the box of the domain."""
+        return bool(((q >= self._low) & (q <= self._high)).all())
+
+    def stop(self, k: int, q: Array) -> Stop:
+        """What the k-th function stands for, at q (n,)."""
+        n = len(q)
+        if k >= 2 * n:
+            wall = self._curved[k - 2 * n]
+            if wall.kind is StopKind.CONTACT and self._collisions is not None:
+                first, second = self._collisions.distance(q).pair
+                return Stop(wall.kind, condition=f"'{first}' and '{second}'")
+            value = np.nan if wall.value is None else float(wall.value(q))
+            return Stop(wall.kind, value=value, condition=wall.heading)
+        i = k % n
+        boundary, limit = (self._low, self._robot.lower) if k < n else (self._high, self._robot.upper)
+        at_limit = bool(abs(boundary[i] - limit[i]) <= RULES.at_limit * self._domain.half_width[i])
+        return Stop(StopKind.JOINT, self._robot.joint_names[i], float(boundary[i]), at_limit)
+
+    def may_touch(self, q: Array, t: Array, new: Array, onward: Array) -> bool:
+        """Whether a contact deeper than a tolerance may lie on an arc between joint positions (n,) with end tangents.
+
+        An arc whose tangent turns by an angle a is no farther from its chord c than (c / 2) tan(a / 2).
+        """
+        chord = float(np.linalg.norm(new - q))
+        if self._collisions is None or chord < RULES.grazing:
+            return False
+        bend = chord / 2 * float(np.tan(np.arccos(np.clip(t @ onward, 0.0, 1.0)) / 2))
+        return self._collisions.find_contact(np.array([q, new]), -RULES.depth, bend) is not None
+
+    def worst(self, q: Array) -> Stop:
+        """The boundary that q (n,) has crossed farthest, or is nearest to."""
+        return self.stop(int(np.argmin(self.values(q))), q)
+
+    def gap(self, q: Array, start: Array) -> Array:
+        """q - start (n,), up to full turns of unbounded revolute joints."""
+        return np.asarray(wrap_shortest(q - start, 2 * np.pi * self.turning))
 
 
 class Clearance:
@@ -49,8 +172,7 @@ class Clearance:
     """
 
     def __init__(self, collisions: Collisions, tree: KinematicTree, margin: float | None, avoid: float | None) -> None:
-        require_kind("collisions", collisions, Collisions)
-        collisions.require_for(tree)
+        require_collisions(collisions, tree)
         self.collisions, self._tree = collisions, tree
         self.margin = as_number("margin", RULES.margin if margin is None else margin)
         if not 0 <= self.margin < RULES.largest:

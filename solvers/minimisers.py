@@ -1,18 +1,113 @@
-"""SciPy's L-BFGS-B behind the protocol of solvers, also preconditioned by a Gauss-Newton matrix."""
+"""Minimisers in NumPy and SciPy: Gauss-Newton, L-BFGS, L-BFGS preconditioned by a Gauss-Newton matrix, and Adam."""
 
-from collections.abc import Callable, Sequence
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
+from itertools import repeat
 
 import numpy as np
 import scipy
 
 from orthocas.errors import InvalidValueError, SolveError
-from orthocas.solvers.protocol import RULES, BestPoint, EstimatedObjective, Objective, SolveResult, Status
+from orthocas.solvers.protocol import (
+    RULES,
+    BestPoint,
+    EstimatedObjective,
+    LeastSquaresObjective,
+    Objective,
+    SampledObjective,
+    SolveResult,
+    Status,
+)
 from orthocas.tools.checks import Array, as_number, require_at_least, require_count
 from orthocas.tools.progress import UNWATCHED, Watch
 
 _STATUS = {0: Status.CONVERGED, 1: Status.ITERATION_LIMIT}  # of SciPy
+
+
+@dataclass(frozen=True)
+class GaussNewton:
+    """Levenberg-Marquardt: (H + mu diag H) step = -gradient; mu falls after a good step and rises after a bad one.
+
+    The loss does not depend on the scale of each coordinate. Damping takes care of these flat directions.
+
+    Args:
+        max_iterations: largest number of accepted steps.
+        tolerance: stop when two steps in a row reduce the loss by less than this fraction each.
+    """
+
+    max_iterations: int = 100
+    tolerance: float = 1e-3
+    name: str = "gauss_newton"
+
+    def __post_init__(self) -> None:
+        require_count("max_iterations", self.max_iterations)
+        require_at_least("tolerance", self.tolerance, 0)
+
+    def coarser(self) -> GaussNewton:
+        """The same solver with at most 10 iterations, which stops when two steps gain less than 0.5 % each."""
+        return replace(self, max_iterations=min(10, self.max_iterations), tolerance=max(5e-3, self.tolerance))
+
+    def minimise(self, objective: Objective, theta0: Array, watch: Watch = UNWATCHED) -> SolveResult:
+        """Minimise from theta0.
+
+        Raises:
+            InvalidValueError: if the objective has no normal equations because the parametrisation is not linear in
+                theta.
+        """
+        if not isinstance(objective, LeastSquaresObjective):
+            raise InvalidValueError(
+                "solver", self.name, "lbfgs or adam for a parametrisation that is not linear in its parameters"
+            )
+        best = BestPoint(objective, theta0, watch)
+        return best.run(lambda: self._descend(best, objective))
+
+    def _descend(self, best: BestPoint, objective: LeastSquaresObjective) -> Status:
+        damping, gained_little = 1e-3, False
+        while best.iterations < self.max_iterations:
+            before, gradient, H = objective.normal_equations(best.theta)
+            best.evaluations += 1
+            best.offer(best.theta, before)
+            if not (np.isfinite(before) and np.isfinite(gradient).all() and np.isfinite(H).all()):
+                return Status.FAILED
+            next_damping = _step_down(best, gradient, H, damping)
+            if next_damping is None:
+                return Status.STALLED if np.any(gradient) else Status.CONVERGED
+            # a step after rejections is short: a small gain is no convergence
+            little = next_damping <= damping and before - best.value <= self.tolerance * before
+            damping = next_damping
+            converged, gained_little = little and gained_little, little
+            best.next_iteration(self.max_iterations)
+            if converged:
+                return Status.CONVERGED
+        return Status.ITERATION_LIMIT
+
+
+def _step_down(best: BestPoint, gradient: Array, H: Array, damping: float) -> float | None:
+    """Try steps with growing damping until the loss falls; returns the damping of the next step, or None."""
+    # Levenberg and Marquardt: damping in proportion to the diagonal
+    diagonal = H.diagonal()
+    scale = np.maximum(diagonal, 1e-3 * diagonal.mean())
+    for _ in range(RULES.most_rejections):
+        damped = H.copy()
+        damped[np.diag_indices_from(H)] += damping * scale
+        try:
+            try:
+                step = scipy.linalg.cho_solve(scipy.linalg.cho_factor(damped), gradient)
+            except np.linalg.LinAlgError:  # rounding in single precision has left it indefinite
+                step = np.linalg.solve(damped, gradient)
+        except np.linalg.LinAlgError:
+            damping *= 10
+            continue
+        # less damping after a success, more after a failure
+        candidate = best.theta - np.asarray(step, dtype=float)
+        best.evaluations += 1
+        if best.offer(candidate, best.objective.value(candidate)):
+            return max(damping / 5, 1e-7)
+        damping *= 4
+    return None
 
 
 @dataclass(frozen=True)
@@ -35,7 +130,7 @@ class LBFGS:
         require_count("memory", self.memory)
         require_at_least("tolerance", self.tolerance, 0)
 
-    def coarser(self) -> "LBFGS":
+    def coarser(self) -> LBFGS:
         """The same solver with a quarter of the iterations."""
         return replace(self, max_iterations=max(1, self.max_iterations // 4))
 
@@ -102,7 +197,7 @@ class QuasiNewton(LBFGS):
         if not 0 <= as_number("renewal", self.renewal) < 1:
             raise InvalidValueError("renewal", self.renewal, "a number from 0 to below 1")
 
-    def coarser(self) -> "QuasiNewton":
+    def coarser(self) -> QuasiNewton:
         """The same solver with at most 15 iterations, which stops when two steps gain less than 0.5 % each."""
         limit = min(15, self.max_iterations)
         return replace(self, max_iterations=limit, tolerance=max(5e-3, self.tolerance))
@@ -221,3 +316,66 @@ def _solve(factors: Sequence[Array], vector: Array, transposed: bool = False) ->
     # numbers that are not finite are for the loss to report
     solve = partial(scipy.linalg.solve_triangular, trans=int(transposed), lower=True, check_finite=False)
     return np.concatenate([solve(factor, part) for factor, part in parts], dtype=float)
+
+
+@dataclass(frozen=True)
+class Adam:
+    """Adam [KB2015]: steps along the mean gradient divided by the root of its mean square, with new samples each time.
+
+    After every epoch, the loss on the fixed samples is evaluated and the best point so far is kept. The learning rate
+    falls to zero along half a cosine, which makes the last epochs the best ones. Objectives without samples are used as
+    a whole.
+
+    Args:
+        epochs: number of epochs; 200 in the paper.
+        steps: steps per epoch; 50 in the paper.
+        batch: fresh samples per step; 200 in the paper.
+        learning_rate: learning rate of the first step (the paper does not state it).
+    """
+
+    epochs: int = 200
+    steps: int = 50
+    batch: int = 200
+    learning_rate: float = 1e-3
+    name: str = "adam"
+
+    def __post_init__(self) -> None:
+        for name in ("epochs", "steps", "batch"):
+            require_count(name, getattr(self, name))
+        require_at_least("learning_rate", self.learning_rate, 1e-300)
+
+    def coarser(self) -> Adam:
+        """The same solver with a quarter of the epochs."""
+        return replace(self, epochs=max(1, self.epochs // 4))
+
+    def minimise(self, objective: Objective, theta0: Array, watch: Watch = UNWATCHED) -> SolveResult:
+        """Minimise from theta0. A run of all planned epochs has the status ITERATION_LIMIT."""
+        best = BestPoint(objective, theta0, watch)
+        return best.run(lambda: self._descend(best))
+
+    def _descend(self, best: BestPoint) -> Status:
+        objective, theta = best.objective, np.array(best.theta)
+        mean, square = np.zeros_like(theta), np.zeros_like(theta)
+        if not np.isfinite(best.evaluate(theta)):
+            return Status.FAILED
+        while best.iterations < self.epochs:
+            # the steps of an epoch: on batches of samples in turn, or on the whole objective
+            parts: Iterable[Objective] = repeat(objective, self.steps)
+            if isinstance(objective, SampledObjective):
+                parts = objective.batches(self.batch, self.steps, (best.iterations,))
+            for k, part in enumerate(parts, best.iterations * self.steps):
+                gradient = part.value_and_gradient(theta)[1]
+                best.evaluations += 1
+                if not np.isfinite(gradient).all():
+                    return Status.STALLED
+                rate = self.learning_rate * 0.5 * (1 + np.cos(np.pi * k / (self.epochs * self.steps)))
+                # in parts that stay in the cache
+                for start in range(0, len(gradient), RULES.part):
+                    own = slice(start, start + RULES.part)
+                    mean[own] += (1 - RULES.moment) * (gradient[own] - mean[own])
+                    square[own] += (1 - RULES.square) * (gradient[own] ** 2 - square[own])
+                    unbiased = np.sqrt(square[own] / (1 - RULES.square ** (k + 1))) + RULES.small
+                    theta[own] -= rate / (1 - RULES.moment ** (k + 1)) * mean[own] / unbiased
+            best.evaluate(theta)
+            best.next_iteration(self.epochs)
+        return Status.ITERATION_LIMIT

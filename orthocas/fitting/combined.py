@@ -1,21 +1,111 @@
-"""Fits with a bound on the angles between coordinates (`max_mutual_deg`), by Ipopt, for families linear in theta."""
+"""Objectives made of others: weighted sums, parts of the samples, and a bound on the angles between coordinates."""
 
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import replace
+from functools import reduce
+from typing import Self
 
 import numpy as np
+from numpy.typing import NDArray
 
 from orthocas.charts.point_quality import pairs
 from orthocas.errors import InfeasibleError, InvalidValueError, SolveError
 from orthocas.fitting.basis_objective import BasisObjective
+from orthocas.fitting.network_objective import ArrayObjective, GraphObjective
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, Weights
-from orthocas.solvers.gauss_newton import GaussNewton
-from orthocas.solvers.protocol import SolveResult, Status
+from orthocas.solvers.minimisers import GaussNewton
+from orthocas.solvers.protocol import Objective, SampledObjective, SolveResult, Status
 from orthocas.tools.checks import Array
+
+
+class WeightedSum:
+    """A sum of losses of the same parameters on several sets of samples, each times a weight.
+
+    Only the first one may draw fresh samples, such as the loss on the domain beside a penalty on its worst points.
+    """
+
+    def __init__(self, parts: Sequence[tuple[float, Objective]]) -> None:
+        self.parts = parts
+
+    def value(self, theta: Array) -> float:
+        """The sum at theta (size,)."""
+        return sum(weight * part.value(theta) for weight, part in self.parts)
+
+    def value_and_gradient(self, theta: Array) -> tuple[float, Array]:
+        """The sum and its gradient, (size,)."""
+        results = [(weight, *part.value_and_gradient(theta)) for weight, part in self.parts]
+        return sum(weight * value for weight, value, _ in results), _add((weight, g) for weight, _, g in results)
+
+    def batches(self, size: int, count: int, seed: tuple[int, ...]) -> Iterator[Self]:
+        """The first loss on fresh samples, each time with the same others."""
+        (weight, first), *others = self.parts
+        assert isinstance(first, SampledObjective)
+        for loss in first.batches(size, count, seed):
+            yield type(self)([(weight, loss), *others])
+
+
+class LinearSum(WeightedSum):
+    """A weighted sum for families linear in theta, with second derivatives."""
+
+    parts: Sequence[tuple[float, BasisObjective]]
+
+    def normal_equations(self, theta: Array) -> tuple[float, Array, Array]:
+        """The sum, its gradient and its Gauss-Newton matrix."""
+        results = [(weight, *part.normal_equations(theta)) for weight, part in self.parts]
+        value, slopes = sum(w * value for w, value, *_ in results), _add((w, slope) for w, _, slope, _ in results)
+        return value, slopes, _add((w, H) for w, *_, H in results)
+
+    def curvature_estimate(self, theta: Array) -> list[Array]:
+        """A rough Gauss-Newton matrix of the sum, in blocks."""
+        estimates = [[(weight, block) for block in part.curvature_estimate(theta)] for weight, part in self.parts]
+        return [_add(blocks) for blocks in zip(*estimates, strict=True)]
+
+    def hessian(self, theta: Array) -> Array:
+        """The Hessian of the sum."""
+        return _add((weight, part.hessian(theta)) for weight, part in self.parts)
+
+
+def _add(parts: Iterable[tuple[float, Array]]) -> Array:
+    return np.asarray(reduce(np.add, [weight * array for weight, array in parts]))
+
+
+class Resampled:
+    """A loss of networks on some of its samples. Steps take others, drawn from all.
+
+    Args:
+        whole: the loss on all samples.
+        watched: places of the samples on which it is watched.
+        count: number of all samples.
+    """
+
+    def __init__(self, whole: ArrayObjective | GraphObjective, watched: NDArray[np.int_], count: int) -> None:
+        self._whole, self._count = whole, count
+        self._watched = whole.part(watched)
+
+    def value(self, theta: Array) -> float:
+        """The mean over the samples that are watched."""
+        return self._watched.value(theta)
+
+    def value_and_gradient(self, theta: Array) -> tuple[float, Array]:
+        """The mean over the samples that are watched, and its gradient."""
+        return self._watched.value_and_gradient(theta)
+
+    def batches(self, size: int, count: int, seed: tuple[int, ...]) -> Iterator[Objective]:
+        """The mean over `size` samples drawn from all, `count` times."""
+        rng, size = np.random.default_rng(seed), min(size, self._count)
+        while count > 0:
+            # all samples are gathered once in a random order: parts of them need no copies
+            shuffled = self._whole.part(rng.permutation(self._count)[: count * size])
+            for start in range(0, min(count * size, self._count - size + 1), size):
+                yield shuffled.part(slice(start, start + size))
+                count -= 1
 
 
 def bound_mutual_angles(
     objective: BasisObjective, theta: Array, bound: float, r: int, fresh: bool
-) -> tuple["BoundedMutual", Array]:
+) -> tuple[BoundedMutual, Array]:
     """The problem with a bound on the mutual angles, and its start.
 
     Args:
