@@ -15,7 +15,7 @@ from orthocas.charts import quality
 from orthocas.charts.certificate import METHODS
 from orthocas.charts.chart_file import CHART
 from orthocas.charts.ready import card, load, names
-from orthocas.cli.options import AsJson, ChartPath, Force, Number, Solids, Whole, parse_whole_number, read_solids
+from orthocas.cli.options import AsJson, ChartPath, Force, Number, SolidOptions, Whole, parse_whole_number, spread
 from orthocas.cli.output import (
     build_reach_data,
     format_reach_rows,
@@ -72,15 +72,17 @@ def charts(
         print_rows({**ready.facts(), **commands, **written})
 
 
+@spread("solids", SolidOptions)
 def evaluate(
     chart: ChartPath,
     samples: Annotated[int, Whole("--samples", help="Number of held-out samples.")] = 100_000,
-    collisions: Solids = None,
+    *,
+    solids: SolidOptions,
     json: AsJson = False,
 ) -> None:
     """Measure the quality of a chart on held-out samples of its domain."""
     loaded = load(chart)
-    report = quality.evaluate(loaded, samples, collisions=read_solids(loaded.problem.robot, collisions))
+    report = quality.evaluate(loaded, samples, collisions=solids.build_model(loaded.problem.robot))
     if json:
         print_json({**report.as_dict(), **build_reach_data(loaded)})
     else:

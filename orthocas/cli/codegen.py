@@ -9,7 +9,7 @@ import typer
 
 from orthocas.charts.chart import Chart
 from orthocas.charts.ready import load
-from orthocas.cli.options import AsJson, ChartPath, Force, Limit, Solids, parse_one_or_all, read_solids, spread_options
+from orthocas.cli.options import AsJson, ChartPath, Force, Limit, SolidOptions, parse_one_or_all, spread, spread_options
 from orthocas.cli.output import note, print_json, print_rows
 from orthocas.codegen.check import check_c
 from orthocas.codegen.export import LIBRARIES
@@ -51,6 +51,7 @@ def _find_laws_with(setting: str) -> list[str]:
 
 
 @add_law_options(for_codegen=True)
+@spread("solids", SolidOptions)
 def codegen(
     chart: ChartPath,
     controller: Annotated[
@@ -67,13 +68,14 @@ def codegen(
     single_precision: Annotated[
         bool, typer.Option("--float", help="Numbers are float instead of double, for processors in single precision.")
     ] = False,
-    collisions: Solids = None,
+    *,
+    solids: SolidOptions,
     force: Force = False,
     json: AsJson = False,
 ) -> None:
     """Write a chart, the robot's dynamics, the inverse map and a controller as C99."""
     if controller == _TRACK:
-        if settings or limit is not None or check or single_precision or collisions is not None:
+        if settings or limit is not None or check or single_precision or solids != SolidOptions():
             raise OptionError(f"--controller {_TRACK} takes --out, --name and --force")
         _write_tracker(chart, out, name, force, json)
         return
@@ -88,8 +90,8 @@ def codegen(
         # Raises for grown charts.
         loaded.function("xi")
         law = None if controller == _NONE else build_controller(controller, loaded, settings, limit)
-        solids = read_solids(loaded.problem.robot, collisions)
-        capsules = None if solids is None else fit_capsules(solids)
+        model = solids.build_model(loaded.problem.robot)
+        capsules = None if model is None else fit_capsules(model)
         generated = generate_c(loaded, out, law, name, force, single_precision=single_precision, capsules=capsules)
         remarks = [] if law is None else [*law.remarks()]
     # Pairs that no distance in C will ever see are for the user to judge.

@@ -22,8 +22,8 @@ from orthocas.cli.options import (
     ProblemName,
     ProblemOptions,
     SampleCount,
+    SolidOptions,
     Whole,
-    add_solids,
     is_robot_file,
     parse_weights,
     spread,
@@ -93,7 +93,7 @@ _SOLIDS = "With --domain branch: be regular where the robot does not hit itself,
 
 
 @dataclass(frozen=True)
-class FitOptions:
+class FitOptions(SolidOptions):
     """The options of a fit, beside those that describe its problem."""
 
     param: Annotated[str | None, typer.Option("--param", help=_PARAM)] = None
@@ -108,9 +108,7 @@ class FitOptions:
     seed: Annotated[int, Whole("--seed", help="Seed of the samples and of random starts.")] = 0
     weights: Annotated[str, typer.Option("--weights", help=_WEIGHTS)] = WEIGHTS_TEXT
     angles: Annotated[str | None, typer.Option("--angles", help=_ANGLES)] = None
-    collisions: Annotated[
-        str | None, typer.Option("--collisions", metavar="FILE.urdf|NAME[,FILE.srdf]", help=_SOLIDS)
-    ] = None
+    collisions: Annotated[str | None, typer.Option("--collisions", metavar="FILE.urdf|NAME", help=_SOLIDS)] = None
 
     @property
     def parametrisation(self) -> Parametrisation | None:
@@ -149,7 +147,7 @@ class FitOptions:
         if self.domain not in (None, _AUTO) and kind != _BRANCH:
             want = "auto, branch, branch:NAME, all, or --centre and --half-width for a box of your own"
             raise InvalidValueError("--domain", repr(self.domain), want)
-        if kind != _BRANCH and self.collisions is not None:
+        if kind != _BRANCH and (self.collisions, self.srdf) != (None, None):
             raise OptionError("--collisions requires --domain branch")
         if self.exact and (kind != _BRANCH or self.like is None):
             raise OptionError("--exact requires --domain branch and --like")
@@ -296,16 +294,15 @@ def _fit_wide(
     words.require_none(("centre", "half_width"), "--domain branch is a domain")
     base = None if is_robot_file(name) else replace(words, least_singular_value=None).build_problem(name)
     robot, task, metric = _build_parts(name, words, base)
-    if options.collisions is not None:
-        # The task is one of the same joints.
-        robot = add_solids(robot, options.collisions)
-        task = Task.from_recipe(robot, task.recipe)
+    solid = options.add_to(robot)
+    # The task is one of the same joints.
+    task = task if solid is robot else Task.from_recipe(solid, task.recipe)
     centre = None if base is None or branch else base.domain.home
     with warnings.catch_warnings():
         # commands print a note instead
         warnings.simplefilter("ignore", BranchWarning)
         return fit_wide(
-            robot,
+            solid,
             task,
             branch or None,
             metric,

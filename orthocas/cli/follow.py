@@ -9,7 +9,7 @@ import typer
 
 from orthocas.charts.chart import Chart
 from orthocas.charts.ready import load
-from orthocas.cli.options import AsJson, ChartPath, Force, Number, Solids, parse_numbers, parse_one_or_all, read_solids
+from orthocas.cli.options import AsJson, ChartPath, Force, Number, SolidOptions, parse_numbers, parse_one_or_all, spread
 from orthocas.cli.output import print_json, print_rows
 from orthocas.errors import InvalidValueError, OptionError
 from orthocas.paths.follow import HOLD, OBJECTIVE
@@ -24,6 +24,7 @@ SCHEDULE = "schedule"
 _CHOICES = (HOLD, SCHEDULE, OBJECTIVE)
 
 
+@spread("solids", SolidOptions)
 def follow(
     chart: ChartPath,
     path: Annotated[Path, typer.Argument(metavar="PATH.csv", help="Waypoints of the tool, see docs/how-to/paths.md.")],
@@ -48,7 +49,8 @@ def follow(
     clearance: Annotated[
         float, Number("--clearance", help="Smallest distance of links, and of links and obstacles [m].")
     ] = 0.0,
-    collisions: Solids = None,
+    *,
+    solids: SolidOptions,
     force: Force = False,
     json: AsJson = False,
 ) -> None:
@@ -61,17 +63,17 @@ def follow(
         loaded.function("xi")
     # What is to be followed, and what the arm may hit: its links, or rods in their place, and obstacles.
     waypoints, choice = _read_task(path, loaded, xi)
-    solids = read_solids(loaded.problem.robot, collisions)
-    if link_radius is not None and (solids is not None or not obstacle):
+    model = solids.build_model(loaded.problem.robot)
+    if link_radius is not None and (model is not None or not obstacle):
         raise OptionError("--link-radius requires --obstacle, and no --collisions, which has the true links")
     if obstacle:
         scene = Scene({f"obstacle {k}": _build_obstacle(text) for k, text in enumerate(obstacle)})
-        if link_radius is None and solids is None and loaded.problem.robot.solids is None:
+        if link_radius is None and model is None and loaded.problem.robot.solids is None:
             raise OptionError(
                 "--obstacle requires --collisions FILE.urdf, or --link-radius: the links' solids are unknown"
             )
         robot = loaded.problem.robot if link_radius is None else loaded.problem.robot.with_rods(link_radius)
-        solids = (robot.collisions if solids is None else solids).with_scene(scene)
+        model = (robot.collisions if model is None else model).with_scene(scene)
     # The motion on time stamps, within limits of velocity and acceleration.
     begin = time.perf_counter()
     motion = follow_path(
@@ -81,7 +83,7 @@ def follow(
         period=period,
         velocity_limits=None if velocity is None else parse_one_or_all("--velocity-limit", velocity),
         clearance=clearance,
-        collisions=solids,
+        collisions=model,
     )
     seconds = time.perf_counter() - begin
     motion.save_csv(out, force)

@@ -9,7 +9,7 @@ import typer
 
 from orthocas import problems
 from orthocas.bases.cyclic import cyclic_joints
-from orthocas.cli.options import AsJson, ProblemName, ProblemOptions, Solids, is_robot_file, read_solids, spread
+from orthocas.cli.options import AsJson, ProblemName, ProblemOptions, SolidOptions, is_robot_file, spread
 from orthocas.cli.output import build_reach_data, print_json, print_rows, print_table
 from orthocas.errors import OptionError, RobotError, SingularTaskError
 from orthocas.exact.involutivity import involutivity
@@ -32,13 +32,15 @@ _SHARES = ("share", "clear_share", "share of the branch", "branches", *_FAULTS) 
 
 
 @spread("words", ProblemOptions, "tip", "lock", "base")
+@spread("solids", SolidOptions)
 def info(
     target: ProblemName,
     words: ProblemOptions,
     branches: Annotated[
         bool, typer.Option("--branches", help="Of a robot: also the branches of its joint range, for wide charts.")
     ] = False,
-    collisions: Solids = None,
+    *,
+    solids: SolidOptions,
     json: AsJson = False,
 ) -> None:
     """Show a chart, a named problem, or a robot."""
@@ -49,14 +51,14 @@ def info(
             **_describe_robot(robot),
             **_describe_redundancy(robot),
             **(_describe_branches(robot, None) if branches else {}),
-            **_describe_collisions(read_solids(robot, collisions), robot.sample),
+            **_describe_collisions(solids.build_model(robot), robot.sample),
         }
     elif target in problems.names():
         problem = words.build_problem(target)
         data = {
             **_describe_problem(problem),
             **(_describe_branches(problem.robot, problem.task) if branches else {}),
-            **_describe_collisions(read_solids(problem.robot, collisions), problem.domain.sample),
+            **_describe_collisions(solids.build_model(problem.robot), problem.domain.sample),
         }
     elif branches:
         raise OptionError(f"--branches requires a robot file or a named problem, not the chart {target}")
@@ -68,7 +70,7 @@ def info(
             "parametrisation": chart.coordinates.label,
             "parameters": chart.coordinates.size,
             **build_reach_data(chart),
-            **_describe_collisions(read_solids(chart.problem.robot, collisions), chart.problem.domain.sample),
+            **_describe_collisions(solids.build_model(chart.problem.robot), chart.problem.domain.sample),
             "notes": dict(chart.notes),
             **({"certificate": chart.certificate.as_dict()} if chart.certificate else {}),
         }

@@ -54,12 +54,6 @@ SampleCount = Annotated[
 ]
 _LIMIT = 'Largest torque or speed, "50" or "50,40,..." per joint; default: the limits of the robot.'
 Limit = Annotated[str | None, typer.Option("--limit", help=_LIMIT)]
-_SOLIDS = (
-    "Check collisions with the solids of this URDF file of the robot, or of a known robot such as panda. After a "
-    "comma, an SRDF file whose disabled pairs are not checked; default: that of the URDF file."
-)
-Solids = Annotated[str | None, typer.Option("--collisions", metavar="FILE.urdf|NAME[,FILE.srdf]", help=_SOLIDS)]
-
 # Options that describe a robot and a problem. Commands say which of them they take.
 
 ROBOT = ("tip", "lock", "tool", "base", "gravity", "payload")
@@ -77,6 +71,9 @@ _HOME = "Named posture as centre of the domain, from an MJCF file or the SRDF be
 _HALF_WIDTH = 'Half-width of the domain, "0.4" or one per joint [rad or m]; radius of a corridor.'
 _LEAST = "Leave positions out of the domain where the task's relative singular value is smaller, such as 0.1."
 
+_SOLIDS = "Check collisions with the solids of this URDF file of the robot, or of a known robot such as panda."
+_SRDF = "SRDF file whose disabled pairs are not checked; default: that of the URDF file."
+
 # Options of earlier versions, and what says the same now. Commands refuse them with these words.
 
 FORMER = {
@@ -90,10 +87,10 @@ FORMER = {
     "--gravity": "the gravity of a robot is an option of fit; whether a law compensates gravity: "
     "codegen --gravity-compensation law or robot",
     "--cycles": "a comparison has three cycles; orthocas.viewer.cyclic_motions takes their number",
-    "--srdf": "name the file after that of the solids: --collisions FILE.urdf,FILE.srdf",
     "--tool": "a tool changes nothing there; fit takes it",
     "--seed": "the seed of noise is a third number of --noise; of an evaluation, oc.evaluate(chart, seed=2) sets it",
     "--held-out": "the number of held-out samples is set in Python: oc.compare(held_out=1000)",
+    "--like": "coordinates that are like something are those of fit",
     "--max-mutual-deg": "the bound is set in Python: oc.fit(max_mutual_deg=2)",
     "--compiled": "set in Python: oc.simulate(compiled=True)",
     "--acceleration-limit": "limits of acceleration are set in Python: oc.follow(acceleration_limits=2)",
@@ -205,23 +202,34 @@ class ProblemOptions:
         return None if self.half_width is None else parse_one_or_all("--half-width", self.half_width)
 
 
-def read_solids(robot: Robot, solids: str | None) -> Collisions | None:
-    """The collision model that --collisions names; None without it. Errors as in `add_solids`."""
-    return None if solids is None else add_solids(robot, solids).collisions
+@dataclass(frozen=True)
+class SolidOptions:
+    """The command-line options that name the solids of a robot, and the pairs that are not checked."""
 
+    collisions: Annotated[str | None, typer.Option("--collisions", metavar="FILE.urdf|NAME", help=_SOLIDS)] = None
+    srdf: Annotated[Path | None, typer.Option("--srdf", help=_SRDF)] = None
 
-def add_solids(robot: Robot, solids: str) -> Robot:
-    """The robot with the solids, and pairs to leave out, that --collisions names.
+    def add_to(self, robot: Robot) -> Robot:
+        """The robot with these solids; the robot itself without the options.
 
-    Raises:
-        RobotError: if a file cannot be read, or is that of another robot.
-    """
-    urdf, _, srdf = solids.partition(",")
-    path = find_robot_file(urdf) if is_robot_name(urdf) else Path(urdf)
-    solid = robot.with_solids(path, srdf or None)
-    if missing := solid.collisions.missing:
-        note(f"nothing is known of {listed(missing)}: no mesh in {path}, so contacts with it go unseen")
-    return solid
+        Raises:
+            OptionError: for --srdf alone.
+            RobotError: if a file cannot be read, or is that of another robot.
+        """
+        if self.collisions is None:
+            if self.srdf is not None:
+                raise OptionError("--srdf requires --collisions FILE.urdf, which has the solids")
+            return robot
+        path = find_robot_file(self.collisions) if is_robot_name(self.collisions) else Path(self.collisions)
+        solid = robot.with_solids(path, self.srdf)
+        if missing := solid.collisions.missing:
+            note(f"nothing is known of {listed(missing)}: no mesh in {path}, so contacts with it go unseen")
+        return solid
+
+    def build_model(self, robot: Robot) -> Collisions | None:
+        """The collision model that the options name; None without them. Errors as in `add_to`."""
+        solid = self.add_to(robot)
+        return None if solid is robot else solid.collisions
 
 
 def is_robot_file(name: str) -> bool:

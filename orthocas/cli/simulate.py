@@ -14,7 +14,7 @@ from orthocas.charts.chart import Chart
 from orthocas.charts.quality import evaluate
 from orthocas.charts.ready import load
 from orthocas.cli.codegen import CONTROLLERS, add_law_options, build_controller, require_settings
-from orthocas.cli.options import AsJson, ChartPath, Force, Limit, Number, Solids, parse_numbers, read_solids
+from orthocas.cli.options import AsJson, ChartPath, Force, Limit, Number, SolidOptions, parse_numbers, spread
 from orthocas.cli.output import note, print_json, print_rows, terminal_monitor
 from orthocas.control.controller import Controller, ControlStatus, law_of
 from orthocas.control.reference import Reference
@@ -42,6 +42,7 @@ _FAILED = (Outcome.DIVERGED, Outcome.LOST)  # the input was valid, but the run f
 
 
 @add_law_options(for_codegen=False)
+@spread("solids", SolidOptions)
 def simulate(
     chart: ChartPath,
     controller: Annotated[str, typer.Option("--controller", help=f"Control law: {', '.join(CONTROLLERS)}.")],
@@ -69,7 +70,8 @@ def simulate(
     animation: Annotated[
         str, typer.Option("--animation", help="Format of the animation: gif, mp4 (needs ffmpeg) or none.")
     ] = "gif",
-    collisions: Solids = None,
+    *,
+    solids: SolidOptions,
     force: Force = False,
     json: AsJson = False,
 ) -> None:
@@ -85,7 +87,7 @@ def simulate(
         loaded.function("xi")
         plan = read_steps(steps, loaded)
         law = build_controller(controller, loaded, settings, limit)
-    solids = read_solids(loaded.problem.robot, collisions)
+    model = solids.build_model(loaded.problem.robot)
     robot = None if mass_factor is None else loaded.problem.robot.with_scaled_masses(mass_factor)
     conditions: dict[str, Any] = {
         "control_rate": rate,
@@ -118,8 +120,8 @@ def simulate(
         print_rows(format_report(report, loaded.problem) | {"files": str(out)}, f"orthocas view {out} --chart {chart}")
     for remark in (*law.remarks(), *_list_remarks(report, interrupted)):
         note(remark)
-    if solids is not None:
-        note(_find_contact(solids, run))
+    if model is not None:
+        note(_find_contact(model, run))
     if code := INTERRUPTED if interrupted else int(run.outcome in _FAILED):
         raise typer.Exit(code)
 

@@ -14,10 +14,9 @@ from orthocas.cli.options import (
     AsJson,
     Force,
     ProblemOptions,
-    Solids,
+    SolidOptions,
     is_robot_file,
     parse_whole_number,
-    read_solids,
     spread,
 )
 from orthocas.cli.output import note, print_json, print_rows
@@ -47,6 +46,7 @@ class _Scene:
 
 
 @spread("words", ProblemOptions, "tip", "lock")
+@spread("solids", SolidOptions)
 def view(
     target: Annotated[
         str,
@@ -71,7 +71,8 @@ def view(
         Path | None,
         typer.Option("--export", metavar="PAGE.html", help="Write a page that moves by itself and works offline."),
     ] = None,
-    collisions: Solids = None,
+    *,
+    solids: SolidOptions,
     port: Annotated[str, typer.Option("--port", metavar="[HOST:]PORT", help=_PORT)] = str(PORT),
     force: Force = False,
     json: AsJson = False,
@@ -96,7 +97,7 @@ def view(
     else:
         played = _read_played(scene, path, export)
     arm, meshes, locks = scene.robot, scene.meshes, scene.locked
-    solids = _read_collisions(scene, collisions, export)
+    model = _build_model(scene, solids, export)
     # A page that works offline, or one that is served until Ctrl-C.
     if export is not None:
         shape = export_page(scene.shown, export, robot=arm, robot_file=meshes, locked=locks, force=force)
@@ -108,7 +109,7 @@ def view(
             print_rows({"page": str(export), "size": f"{size / 2**20:.1f} MiB, with all it needs: it works offline"})
         return
     opened = open_view(
-        scene.shown, robot=arm, robot_file=meshes, locked=locks, collisions=solids, path=played, host=host, port=number
+        scene.shown, robot=arm, robot_file=meshes, locked=locks, collisions=model, path=played, host=host, port=number
     )
     with opened as page:
         _note_missing(page.missing)
@@ -156,11 +157,11 @@ def _read_played(scene: _Scene, path: Path | None, export: Path | None) -> Array
     return x if xi is None else np.hstack([x, xi])
 
 
-def _read_collisions(scene: _Scene, solids: str | None, export: Path | None) -> Collisions | None:
+def _build_model(scene: _Scene, solids: SolidOptions, export: Path | None) -> Collisions | None:
     """The collision model that the page of a chart shows."""
     if isinstance(scene.shown, Chart) and export is None:
-        return read_solids(scene.shown.robot, solids)
-    if solids is not None:
+        return solids.build_model(scene.shown.robot)
+    if solids != SolidOptions():
         raise OptionError("--collisions is for live pages of charts: leave it out")
     return None
 

@@ -1,5 +1,6 @@
 """The command line: outputs, exit codes, one-line errors, nothing half-written."""
 
+import inspect
 import json
 import os
 import pty
@@ -7,6 +8,7 @@ import re
 import signal
 import subprocess
 import sys
+from operator import attrgetter
 from pathlib import Path
 
 import numpy as np
@@ -17,6 +19,7 @@ from solid_arms import BALL, build_arm
 
 import orthocas as oc
 from orthocas import problems
+from orthocas.cli.options import FORMER
 from orthocas.fitting.fit import Fit
 from orthocas.tools.files import LIST
 
@@ -425,3 +428,14 @@ with open("file", "w") as stream:
     command = ["sh", "-c", 'exec "$0" -c "$1" >&-', sys.executable, code]
     subprocess.run(command, check=True, cwd=tmp_path)
     assert (tmp_path / "file").read_text() == "mine"
+
+
+CALLS = [call for hint in FORMER.values() for call in re.findall(r"\boc\.([\w.]+)\(([^)]*)\)", hint)]
+
+
+@pytest.mark.parametrize(("name", "arguments"), CALLS)
+def test_what_says_the_same_in_python_exists(name: str, arguments: str) -> None:
+    """The keywords of the calls that hints for former options name."""
+    words = re.findall(r"(\w+)=", arguments)
+    assert words
+    assert set(words) <= set(inspect.signature(attrgetter(name)(oc)).parameters)

@@ -1,4 +1,4 @@
-"""`--collisions`: what commands say of contacts is what Python says."""
+"""`--collisions` and `--srdf`: what commands say of contacts is what Python says."""
 
 import json
 from pathlib import Path
@@ -46,16 +46,16 @@ def test_info_and_evaluate_have_the_share_that_touches(run: Run, arm: tuple[oc.C
     report = json.loads(run("evaluate", "a.orthocas", *options, "--json")[1])
     touching = int((~collisions.check_free(chart.domain.sample(2000, 1))).sum())
     assert report["contacts"]["touching"] == touching
-    again = json.loads(run("evaluate", "a.orthocas", *options[:-1], "arm.urdf,pairs/none.srdf", "--json")[1])
+    again = json.loads(run("evaluate", "a.orthocas", *options, "--srdf", "pairs/none.srdf", "--json")[1])
     assert again["contacts"]["pair"] != ["link0", "link3"]
     robot = json.loads(run("info", "arm.urdf", "--collisions", "arm.urdf", "--json")[1])
     assert robot["collisions"]["pairs"] == len(collisions.pairs)
 
 
-def test_bad_files_and_former_options_are_refused(run: Run, arm: tuple[oc.Chart, Collisions]) -> None:
+def test_bad_files_and_lone_options_are_refused(run: Run, arm: tuple[oc.Chart, Collisions]) -> None:
     code, out, err = run("info", "a.orthocas", "--srdf", "pairs/none.srdf")
     assert (code, out) == (2, "")
-    assert "--collisions FILE.urdf,FILE.srdf" in err
+    assert "--srdf requires --collisions FILE.urdf" in err
     for command in (("evaluate", "a.orthocas"), ("follow", "a.orthocas", "p.csv", "--out", "q.csv")):
         code, out, err = run(*command, "--collisions", "nothing.urdf")
         assert (code, out) == (2, "")

@@ -65,7 +65,8 @@ _VALUES: dict[str, tuple[str, ...]] = {
     **dict.fromkeys(("--seed", "--seeds", "--samples", "--jobs"), _COUNTS),
     **dict.fromkeys(("--rate", "--mass-factor"), (*NUMBERS, "50", "10")),
     **dict.fromkeys(("--period", "--link-radius", "--clearance"), (*NUMBERS, "0.01")),
-    "--collisions": ("arm.urdf", "arm.urdf,arm.srdf", ",", "nothing.urdf", "", "panda", "chart.orthocas,arm.urdf"),
+    "--collisions": ("arm.urdf", "nothing.urdf", "", "panda", "chart.orthocas"),
+    "--srdf": ("arm.srdf", "", "arm.urdf"),
     **dict.fromkeys(("--start", "--velocity-limit"), _LISTS),
     "--obstacle": (
         "",
@@ -106,7 +107,7 @@ _DOMAIN_OPTIONS = ("--task", "--metric", "--centre", "--home", "--half-width")
 _AUTO_OPTIONS = ("--domain", "--leak-deg", "--conditioning")
 _LAW_OPTIONS = ("--stiffness", "--damping-ratio", "--coupling", "--damping", "--feedback", "--limit")
 _RUN_OPTIONS = ("--rate", "--mass-factor", "--friction", "--noise", "--plant")
-_SOLIDS = ("--collisions",)
+_SOLIDS = ("--collisions", "--srdf")
 _COMMANDS: dict[str, tuple[tuple[str, ...], dict[str, str], tuple[str, ...]]] = {  # targets, options, other options
     "fit": (
         _PROBLEMS,
