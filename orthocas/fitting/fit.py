@@ -92,7 +92,7 @@ def fit(
         parametrisation: the family of coordinates. Default: polynomials of degree 5; of degree 4 for eight joints, or
             with a bound on mutual angles; of degree 3 for more joints, and of degree 2 from twelve.
         metric: for a robot and a task, as in `Problem`; so is `domain`.
-        domain: the domain. Default: a box of regular positions around the home of the robot.
+        domain: the domain. Default: as in `Problem`.
         weights: weights of the loss, as `Weights` or as two to five numbers (lambda1, lambda2, ...). The field `angles`
             of `Weights` chooses between the paper's cosines and angles in the metric.
         samples: number of samples. Default: grows with the number of parameters.

@@ -73,12 +73,7 @@ class _SampledLoss(ABC):
             yield other
 
     def elsewhere(self, samples: Samples, weights: Mapping[str, float]) -> Self:
-        """Other terms of the same coordinates at other samples, with the same orientation.
-
-        Args:
-            samples: the samples.
-            weights: weights of the terms by name.
-        """
+        """As in `BasisObjective.elsewhere`."""
         other = copy(self)
         other._loss = Loss.of(self._loss.sizes, weights)
         other._put(samples, len(samples))
