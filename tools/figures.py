@@ -344,11 +344,19 @@ def renew(old: Record, new: Record) -> None:
 
 
 def paired(old: Sequence[tuple[str, str]], new: Sequence[tuple[str, str]]) -> list[tuple[str, str]]:
-    """Rows of old and new tables that belong together: by their labels, in order where these are not unique."""
-    waiting: dict[str, list[str]] = {}
-    for _, row in new:
-        waiting.setdefault(label(row), []).append(row)
-    return [(row, waiting[label(row)].pop(0)) for _, row in old if waiting.get(label(row))]
+    """Rows of old and new tables that belong together: by their labels, in order where these are not unique.
+
+    Labels hold numbers, such as the share of a branch, and these move too: then what is left of them is compared.
+    """
+    matches: dict[int, int] = {}
+    for same in (label, lambda row: NUMBER.sub("#", label(row))):
+        waiting: dict[str, list[int]] = {}
+        for k in sorted(set(range(len(new))) - set(matches.values())):
+            waiting.setdefault(same(new[k][1]), []).append(k)
+        for k, (_, row) in enumerate(old):
+            if k not in matches and waiting.get(same(row)):
+                matches[k] = waiting[same(row)].pop(0)
+    return [(old[k][1], new[matches[k]][1]) for k in sorted(matches)]
 
 
 def label(row: str) -> str:

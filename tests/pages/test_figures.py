@@ -190,3 +190,9 @@ def test_rows_belong_together_by_their_labels_whatever_their_order() -> None:
         ("| a | 5 | 3 | 4 |", "| a | 5 | 3 | 5 |"),
         ("| b, c | x | 5 |", "| b, c | x | 6 |"),
     ]
+
+
+def test_rows_whose_labels_hold_numbers_that_moved_belong_together() -> None:
+    old = [("", "| iiwa, 7 joints | side a, 12% | 5.7 |"), ("", "| panda, 7 joints | side b, 46% | 6.5 |")]
+    new = [("", "| panda, 7 joints | side b, 47% | 6.4 |"), ("", "| iiwa, 7 joints | side a, 12% | 5.8 |")]
+    assert figures.paired(old, new) == [(old[0][1], new[1][1]), (old[1][1], new[0][1])]
