@@ -88,13 +88,12 @@ class EliminationCheck:
         # Products are small, and with one thread their rounding is the same everywhere. On some boxes, bounds are
         # infinite.
         parts = []
-        with one_blas_thread():
+        with one_blas_thread(), np.errstate(invalid="ignore", over="ignore", divide="ignore"):
             J = self.rows(low, high)
             for k in range(0, J.remainder.shape[-1], _AT_ONCE):
                 few = select_boxes(J, slice(k, k + _AT_ONCE))
-                with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-                    turned, signs = rotate_to_singular_basis(few)
-                    regular = have_positive_pivots(compute_pivots(turned)) & (signs != 0)
+                turned, signs = rotate_to_singular_basis(few)
+                regular = have_positive_pivots(compute_pivots(turned)) & (signs != 0)
                 level = np.zeros(len(signs))
                 if self.bound > 0 and regular.any():
                     level[regular] = bound_conditioning(select_boxes(few, regular), self.rows.m)

@@ -131,3 +131,10 @@ def test_what_cannot_be_certified_is_refused() -> None:
         oc.certify(kinked)
     with pytest.raises(CertifyError, match="no certificate"):
         check_certificate(chart())
+
+
+def test_bounds_that_are_infinite_on_large_boxes_prove_nothing_and_warn_of_nothing() -> None:
+    """On the first boxes of a ready wide chart, Taylor models of its network have infinite remainders."""
+    found = oc.certify(oc.load("iiwa7-wide"), time_limit=0.1)
+    assert found.boxes > 0
+    assert found.regular.proved_count == 0
