@@ -1,4 +1,4 @@
-"""Certificates of wide polynomial charts of poses: what is proved of a branch, boxes, and CPU seconds to find and to check."""
+"""Certificates of wide polynomial charts of poses: what is proved of a branch, boxes, and CPU seconds."""
 
 import time
 
