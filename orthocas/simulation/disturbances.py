@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from math import inf, isfinite
+from math import ceil, inf, isfinite
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,7 +20,15 @@ from orthocas.errors import InvalidValueError, OrthocasError, StepsFileError
 from orthocas.robots.kinematics import build_point_jacobian
 from orthocas.robots.tree import KinematicTree
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array, as_float_array, freeze_array, require_count, require_known, require_shape
+from orthocas.tools.checks import (
+    Array,
+    as_float_array,
+    as_number,
+    freeze_array,
+    require_count,
+    require_known,
+    require_shape,
+)
 from orthocas.tools.json import read_strict_json
 
 Link = str | int | None  #: a link, by the joint that moves it (name or index), or a frame by its name; None: the tip
@@ -36,6 +44,7 @@ class SimulationRules:
     outputs: int = 25  #: instants a call of an integrator: one integrator serves all, and Ctrl-C waits for one call
     ticks: int = 50  #: a call, for the same reason
     same_time: float = 1e-9  #: events closer than this differ only by rounding [s]
+    most_steps: int = 100_000  #: of the physics in a tick, about 5 s of computing
     most_ticks: float = 1e7  #: of a sampled run
     most_instants: float = 1e6  #: of a run that is read from a file
     shortest: float = 1e-3  #: time between points, and length of a run or a push [s]
@@ -88,6 +97,17 @@ def require_link(link: object, n: int | None = None) -> None:
     if not whole or link < 0 or (n is not None and link >= n):  # type: ignore[operator]
         most = "" if n is None else f" from 0 to {n - 1}"
         raise InvalidValueError("link", repr(link)[:80], f"the name of a joint, or the index of one{most}")
+
+
+def count_steps(seconds: float, longest: float) -> int:
+    """The number of equal steps of the physics in a tick [s], none longer than a length [s].
+
+    A tick that is a whole number of such steps, but for rounding, gets no further one.
+    """
+    count = as_number("seconds", seconds) / longest - 1e-9
+    if not -1e-9 < count <= RULES.most_steps:
+        raise InvalidValueError("seconds", seconds, f"a number > 0, at most {RULES.most_steps * longest:g}")
+    return max(1, ceil(count))
 
 
 @dataclass(frozen=True, eq=False)

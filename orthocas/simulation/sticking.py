@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import ceil
 
 import casadi as ca
 import numpy as np
@@ -11,7 +10,7 @@ from numpy.typing import ArrayLike
 
 from orthocas.errors import InvalidValueError, SimulationError
 from orthocas.robots.robot import Robot
-from orthocas.simulation.disturbances import Friction
+from orthocas.simulation.disturbances import Friction, count_steps
 from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.checks import Array, as_number, as_point, require_kind
 from orthocas.tools.display import Shown
@@ -22,7 +21,6 @@ class StickingRules:
     """Numbers of the plant that sticks."""
 
     timestep: float = 2.5e-4  #: longest step of the physics [s]
-    most_steps: int = 100_000  #: in a tick
     runaway: float = 1e6  #: velocity [rad/s] or [m/s]
     blocks: int = 10  #: rounds of the pivoting in which all joints change at once; then one by one, which always ends
     rounds: int = 1000  #: of the pivoting, in all
@@ -121,10 +119,7 @@ class StickingPlant(Shown):
         applied = np.clip(as_point("torque", torque, self.robot.n), -self._limit, self._limit)
         if loads is not None:
             applied = applied + as_point("loads", loads, self.robot.n)
-        count = as_number("seconds", seconds) / self._timestep - 1e-9
-        if not -1e-9 < count <= RULES.most_steps:
-            raise InvalidValueError("seconds", seconds, f"a number > 0, at most {RULES.most_steps * self._timestep:g}")
-        steps = max(1, ceil(count))
+        steps = count_steps(seconds, self._timestep)
         h, q, dq = seconds / steps, self.q, self.dq
         for _ in range(steps):
             # Mass matrix and bias at the position in the middle, and the friction that goes with the last velocity.
