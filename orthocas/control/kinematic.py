@@ -149,13 +149,12 @@ class XiTask(Shown):
         require_driven("a task of a quadratic program", chart.problem.robot.tree)
         # Grown charts raise here.
         chart.function("xi")
-        require_at_least("gain", gain, 0)
-        require_at_least("lm_damping", lm_damping, 0)
+        self.gain = require_at_least("gain", gain, 0)
+        self.lm_damping = require_at_least("lm_damping", lm_damping, 0)
         if gain > 1:
             raise InvalidValueError("gain", gain, "a number from 0 to 1")
         self.chart = chart
         self.cost = non_negative_gains("cost", cost, chart.r)
-        self.gain, self.lm_damping = float(gain), float(lm_damping)
         self.joints = chart.problem.robot.joint_names if joints is None else tuple(joints)
         require_shape("joints", (len(self.joints),), (chart.n,))
         self.target_xi: Array | None = None

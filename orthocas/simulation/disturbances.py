@@ -22,11 +22,12 @@ from orthocas.robots.tree import KinematicTree
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import (
     Array,
-    as_float_array,
     as_number,
     freeze_array,
+    require_at_least,
     require_count,
     require_known,
+    require_positive,
     require_shape,
 )
 from orthocas.tools.json import read_strict_json
@@ -142,13 +143,8 @@ class Push:
         point: ArrayLike = (0.0, 0.0, 0.0),
     ) -> None:
         # Two instants, then forces, and where the force acts.
-        for name, value, want in (("start", start, ">= 0"), ("duration", duration, "> 0")):
-            number = as_float_array(f"{name} of a push", value)
-            require_shape(f"{name} of a push", number.shape, ())
-            if not (np.isfinite(number) and (number > 0 or (number == 0 and name == "start"))):
-                raise InvalidValueError(f"{name} of a push", value, f"a finite number {want}")
-        object.__setattr__(self, "start", float(start))
-        object.__setattr__(self, "duration", float(duration))
+        object.__setattr__(self, "start", require_at_least("start of a push", start, 0))
+        object.__setattr__(self, "duration", require_positive("duration of a push", duration))
         object.__setattr__(self, "force", freeze_array("force", force, (3,)))
         object.__setattr__(self, "torque", None if torque is None else freeze_array("torque", torque, (None,)))
         require_link(link)
@@ -250,9 +246,7 @@ class Noise:
     def __post_init__(self) -> None:
         require_count("seed", self.seed, least=0)
         for name in ("position", "velocity"):
-            value = as_float_array(f"{name} noise", getattr(self, name))
-            if value.shape or not (np.isfinite(value) and value >= 0):
-                raise InvalidValueError(f"{name} noise", getattr(self, name), "a finite number >= 0")
+            require_at_least(f"{name} noise", getattr(self, name), 0)
 
     def sample(self, ticks: int, n: int) -> Array:
         """Measurement errors of q and dq, (ticks, 2 n)."""

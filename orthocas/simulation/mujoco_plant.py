@@ -17,7 +17,16 @@ from orthocas.robots.robot import Robot
 from orthocas.robots.spatial import rotate_z_to
 from orthocas.robots.tree import KinematicTree, require_body
 from orthocas.simulation.disturbances import Friction, Link, count_steps, place_of
-from orthocas.tools.checks import Array, as_number, as_point, freeze_array, import_extra, require_at_least, require_kind
+from orthocas.tools.checks import (
+    Array,
+    as_number,
+    as_point,
+    freeze_array,
+    import_extra,
+    require_at_least,
+    require_kind,
+    require_positive,
+)
 from orthocas.tools.display import Shown
 
 MUJOCO = "mujoco"  #: name of this plant
@@ -65,8 +74,7 @@ class Payload:
     def __init__(
         self, mass: float, centre: ArrayLike = (0.0, 0.0, 0.0), inertia: ArrayLike = ((0.0,) * 3,) * 3
     ) -> None:
-        require_at_least("mass of a payload", mass, 0.0)
-        object.__setattr__(self, "mass", as_number("mass of a payload", mass))
+        object.__setattr__(self, "mass", require_at_least("mass of a payload", mass, 0.0))
         object.__setattr__(self, "centre", freeze_array("centre of a payload", centre, (3,)))
         object.__setattr__(self, "inertia", freeze_array("inertia of a payload", inertia, (3, 3)))
         require_body("tip", self.mass, self.inertia, 0.0)
@@ -99,8 +107,7 @@ class Wall:
             raise InvalidValueError("normal of a wall", normal.tolist(), "a direction other than zero")
         object.__setattr__(self, "normal", freeze_array("normal", normal / np.linalg.norm(normal), (3,)))
         for name in ("tip_radius", "size", "thickness", "time_constant"):
-            if not 0 < as_number(f"{name} of a wall", getattr(self, name)) < np.inf:
-                raise InvalidValueError(f"{name} of a wall", getattr(self, name), "a finite number > 0")
+            require_positive(f"{name} of a wall", getattr(self, name))
 
 
 @dataclass(frozen=True, eq=False)

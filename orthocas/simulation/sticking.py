@@ -8,11 +8,11 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.errors import InvalidValueError, SimulationError
+from orthocas.errors import SimulationError
 from orthocas.robots.robot import Robot
 from orthocas.simulation.disturbances import Friction, count_steps
 from orthocas.tools.batch import Batched, dense_function
-from orthocas.tools.checks import Array, as_number, as_point, require_kind
+from orthocas.tools.checks import Array, as_point, require_kind, require_positive
 from orthocas.tools.display import Shown
 
 
@@ -77,9 +77,7 @@ class StickingPlant(Shown):
         require_kind("robot", robot, Robot)
         friction = Friction() if friction is None else friction
         require_kind("friction", friction, Friction)
-        if not 0 < as_number("timestep", timestep) < np.inf:
-            raise InvalidValueError("timestep", timestep, "a finite number > 0")
-        self.robot, self.friction, self._timestep = robot, friction, float(timestep)
+        self.robot, self.friction, self._timestep = robot, friction, require_positive("timestep", timestep)
         self._viscous, self._coulomb, self._extra, self._speed = np.split(friction.numbers(robot.n), 4)
         self._limit = robot.effort_limits if effort_limits else np.full(robot.n, np.inf)
         q, dq = ca.SX.sym("q", robot.n), ca.SX.sym("dq", robot.n)
