@@ -19,9 +19,18 @@ from orthocas.control.safety import Safety
 from orthocas.errors import Interrupted, InvalidValueError, SimulationError
 from orthocas.robots.robot import Robot
 from orthocas.simulation.disturbances import RULES, Friction, Loads, Noise, Push, Stops
-from orthocas.simulation.loops import ClosedLoop, CompiledLoop, Piece, integrate, run_ticks
+from orthocas.simulation.loops import (
+    ClosedLoop,
+    CompiledLoop,
+    LawWithMemory,
+    Piece,
+    SupervisedLaw,
+    integrate,
+    run_physics,
+    run_supervised,
+    run_ticks,
+)
 from orthocas.simulation.mujoco_plant import MUJOCO, MuJoCo
-from orthocas.simulation.physics import LawWithMemory, SupervisedLaw, run_physics, run_supervised
 from orthocas.simulation.trajectory import Outcome, Trajectory, find_loss
 from orthocas.tools.batch import THREADS, Batched
 from orthocas.tools.checks import Array, as_point, require_executor, require_kind, require_known, require_positive
