@@ -23,7 +23,7 @@ import orthocas as oc
 from orthocas.codegen import GeneratedC
 from orthocas.codegen.rendering import DOUBLE, SINGLE
 from orthocas.control import PDPlus
-from orthocas.native.rendering import write_numbers
+from orthocas.native.kernels import write_numbers
 from orthocas.tools.checks import Array
 
 TOOLS = ("arm-none-eabi-gcc", "qemu-system-arm")

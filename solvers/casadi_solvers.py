@@ -19,7 +19,7 @@ from orthocas.solvers.protocol import (
 )
 from orthocas.tools.blas_graph import DenseNode
 from orthocas.tools.cached import building
-from orthocas.tools.checks import Array, require_at_least, require_count
+from orthocas.tools.checks import Array, require_at_least, require_count, require_positive
 from orthocas.tools.interrupts import check, deferred
 from orthocas.tools.progress import UNWATCHED, Watch
 
@@ -51,7 +51,7 @@ class Ipopt:
 
     def __post_init__(self) -> None:
         require_count("max_iterations", self.max_iterations)
-        require_at_least("tolerance", self.tolerance, 1e-300)
+        require_positive("tolerance", self.tolerance)
 
     def coarser(self) -> "Ipopt":
         """The same solver with a quarter of the iterations and a looser tolerance."""

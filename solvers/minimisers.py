@@ -21,7 +21,7 @@ from orthocas.solvers.protocol import (
     SolveResult,
     Status,
 )
-from orthocas.tools.checks import Array, as_number, require_at_least, require_count
+from orthocas.tools.checks import Array, as_number, require_at_least, require_count, require_positive
 from orthocas.tools.progress import UNWATCHED, Watch
 
 _STATUS = {0: Status.CONVERGED, 1: Status.ITERATION_LIMIT}  # of SciPy
@@ -342,7 +342,7 @@ class Adam:
     def __post_init__(self) -> None:
         for name in ("epochs", "steps", "batch"):
             require_count(name, getattr(self, name))
-        require_at_least("learning_rate", self.learning_rate, 1e-300)
+        require_positive("learning_rate", self.learning_rate)
 
     def coarser(self) -> Adam:
         """The same solver with a quarter of the epochs."""

@@ -9,9 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from orthocas.native.curves import RULES
-from orthocas.native.kernels import generate_kernels
+from orthocas.native.kernels import generate_kernels, get_source, render
 from orthocas.native.libraries import keep_library, load_library, pointer
-from orthocas.native.rendering import get_source, render
 from orthocas.tasks.task import Frames, Task
 from orthocas.tools.batch import dense_function, run_in_threads
 from orthocas.tools.cached import cached_property

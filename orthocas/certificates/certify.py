@@ -210,8 +210,7 @@ def check_options(chart: Chart, time_limit: float | None, executor: Executor | N
     require_executor(executor)
     if time_limit is None:
         return float("inf")
-    require_at_least("time_limit", time_limit, 0)
-    return as_number("time_limit", time_limit)
+    return require_at_least("time_limit", time_limit, 0)
 
 
 def check_bound(chart: Chart, bound: float) -> float:

@@ -20,9 +20,8 @@ from orthocas.charts.descent import BoxedPhi
 from orthocas.charts.newton import inverses
 from orthocas.errors import CompileError, InvalidValueError
 from orthocas.native import curves
-from orthocas.native.kernels import generate_kernels
+from orthocas.native.kernels import generate_kernels, get_source, render
 from orthocas.native.libraries import keep_library, load_library, pointer
-from orthocas.native.rendering import get_source, render
 from orthocas.tasks.relative import Relative
 from orthocas.tools.batch import dense_function, run_in_threads
 from orthocas.tools.cached import cached_property

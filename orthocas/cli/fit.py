@@ -3,27 +3,26 @@
 import time
 import warnings
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import asdict, fields, replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
 
-from orthocas.bases.family import Parametrisation, parse_parametrisation
+from orthocas.bases.family import Parametrisation
 from orthocas.charts.chart_file import CHART
 from orthocas.charts.quality import Report, evaluate
 from orthocas.cli.options import (
+    ALL,
+    AUTO,
+    BRANCH,
     CHAIN,
     DOMAIN,
-    WEIGHTS_TEXT,
     AsJson,
+    FitOptions,
     Force,
-    Number,
     ProblemName,
     ProblemOptions,
-    SampleCount,
-    SolidOptions,
-    Whole,
     is_robot_file,
     parse_weights,
     spread,
@@ -45,11 +44,11 @@ from orthocas.fitting.stages import choose_parametrisation
 from orthocas.fitting.suggest_domain import CONDITIONING, LEAK_DEG, DomainSuggestion, suggest_domain
 from orthocas.fitting.terms import Weights
 from orthocas.fitting.wide import CLEARANCE, WideFit, fit_wide
-from orthocas.paths.chart_along import RADIUS, corridor_problem
+from orthocas.paths.chart_along import corridor_problem
 from orthocas.robots.robot import Robot
 from orthocas.solvers import get as get_solver
 from orthocas.solvers.protocol import Status
-from orthocas.tasks.corridor import read_postures
+from orthocas.tasks.corridor import RADIUS, read_postures
 from orthocas.tasks.metric import Metric
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.task import Task
@@ -59,101 +58,7 @@ from orthocas.tools.interrupts import INTERRUPTED
 from orthocas.tools.json import clean, collect_attributes
 from orthocas.tools.progress import Monitor
 
-_AUTO, _BRANCH, _ALL = "auto", "branch", "all"  # words of --domain
-_IN_CORRIDOR = "polynomial:3:cyclic"  # more terms gain little there
 _WIDE_ROWS = ("regular", "left out", "least leak", "meaning")  # facts of wide fits
-_PARAM = (
-    "Parametrisation: polynomial:5, polynomial:5:cyclic, polynomial:4:joints=2, fourier:2, mlp:64x64, mlp:64x64:raw, "
-    "linear or sew; default: polynomial:5, or polynomial:4 for more than seven joints; polynomial:3:cyclic with "
-    "--corridor; what is regular on the branch with --domain branch."
-)
-_SOLVER = "gauss_newton, quasi_newton, lbfgs, ipopt, adam or gradient_flow; default: what suits the parametrisation."
-_DOMAIN = (
-    "auto: the widest box around the home on which the fit keeps --leak-deg and --conditioning; branch: all of the "
-    "home's branch of the joint range (a wide chart); branch:NAME: of another one, see orthocas info --branches; all: "
-    "a chart of every branch, in an arm file for orthocas solve and oc.Arm."
-)
-_LIKE = "What the first coordinates are like: a joint or swivel; several: NAME,NAME."
-_EXACT = "With --domain branch: they are what --like says itself, on the part of the branch where that can be."
-_CORRIDOR = (
-    "Domain: the surroundings of a path of postures, one a line, with the joint names in the first line; their radius "
-    f"is --half-width [rad], default {RADIUS:g}."
-)
-_LEAK = "Largest leak for --domain auto [deg]; default 8."
-_CONDITIONING = "Smallest conditioning for --domain auto; default 0.2."
-_WEIGHTS = (
-    '"lambda1,lambda2", up to lambda5; "NAME=WEIGHT" for terms of your own. With --domain branch the first two weigh '
-    "leaks and mutual angles, and its own weights are the default."
-)
-_ANGLES = (
-    "Angles in the loss: paper (Euclidean norms) or metric; default: metric with --metric inertia and for tasks that "
-    "turn the tool."
-)
-_SOLIDS = "With --domain branch: be regular where the robot does not hit itself, by the solids of this file."
-
-
-@dataclass(frozen=True)
-class FitOptions(SolidOptions):
-    """The options of a fit, beside those that describe its problem."""
-
-    param: Annotated[str | None, typer.Option("--param", help=_PARAM)] = None
-    solver: Annotated[str | None, typer.Option("--solver", help=_SOLVER)] = None
-    domain: Annotated[str | None, typer.Option("--domain", help=_DOMAIN)] = None
-    like: Annotated[str | None, typer.Option("--like", help=_LIKE)] = None
-    exact: Annotated[bool, typer.Option("--exact", help=_EXACT)] = False
-    corridor: Annotated[Path | None, typer.Option("--corridor", metavar="POSTURES.csv", help=_CORRIDOR)] = None
-    leak_deg: Annotated[float | None, Number("--leak-deg", help=_LEAK)] = None
-    conditioning: Annotated[float | None, Number("--conditioning", help=_CONDITIONING)] = None
-    samples: SampleCount = None
-    seed: Annotated[int, Whole("--seed", help="Seed of the samples and of random starts.")] = 0
-    weights: Annotated[str, typer.Option("--weights", help=_WEIGHTS)] = WEIGHTS_TEXT
-    angles: Annotated[str | None, typer.Option("--angles", help=_ANGLES)] = None
-    collisions: Annotated[str | None, typer.Option("--collisions", metavar="FILE.urdf|NAME", help=_SOLIDS)] = None
-
-    @property
-    def parametrisation(self) -> Parametrisation | None:
-        """That of --param, or of a corridor."""
-        param = _IN_CORRIDOR if self.param is None and self.corridor is not None else self.param
-        return None if param is None else parse_parametrisation(param)
-
-    @property
-    def quantities(self) -> str | list[str] | None:
-        """The name, or several, of --like."""
-        names = [word.strip() for word in (self.like or "").split(",")]
-        return None if self.like is None else names[0] if len(names) == 1 else names
-
-    @property
-    def wide_weights(self) -> Weights | Mapping[str, float] | None:
-        """Weights of a wide fit: numbers take the place of its own weights, terms by name alone join these."""
-        numbers = self.weights != WEIGHTS_TEXT and any("=" not in word for word in self.weights.split(","))
-        if self.angles is not None and not numbers:
-            raise OptionError(
-                "--angles requires the numbers of --weights with --domain branch, such as --weights 12,0.3"
-            )
-        if self.weights == WEIGHTS_TEXT:
-            return None
-        weights = parse_weights(self.weights, self.angles)
-        return weights if numbers else weights.extra
-
-    def parse_domain(self) -> tuple[str, str]:
-        """The kind of a domain, and the name of its branch; raises OptionError for options of another kind."""
-        kind, _, branch = (self.domain or "").partition(":")
-        if self.domain is not None and self.corridor is not None:
-            raise OptionError("--corridor is a domain: leave out --domain")
-        if kind != _AUTO:
-            for option, value in (("leak-deg", self.leak_deg), ("conditioning", self.conditioning)):
-                if value is not None:
-                    raise OptionError(f"--{option} requires --domain auto")
-        if self.domain not in (None, _AUTO) and kind != _BRANCH:
-            want = "auto, branch, branch:NAME, all, or --centre and --half-width for a box of your own"
-            raise InvalidValueError("--domain", repr(self.domain), want)
-        if kind != _BRANCH and (self.collisions, self.srdf) != (None, None):
-            raise OptionError("--collisions requires --domain branch")
-        if self.exact and (kind != _BRANCH or self.like is None):
-            raise OptionError("--exact requires --domain branch and --like")
-        if kind == _BRANCH and self.solver is not None:
-            raise OptionError("--domain branch has a solver of its own: leave out --solver")
-        return kind, branch.strip()
 
 
 @spread("words", ProblemOptions, *CHAIN, *DOMAIN)
@@ -169,7 +74,7 @@ def fit(
     json: AsJson = False,
 ) -> None:
     """Fit extra coordinates to a problem and save the chart."""
-    if options.domain == _ALL:
+    if options.domain == ALL:
         _fit_arm(problem, words, options, out, force, json)
         return
     # What can be refused is refused before anything takes time.
@@ -180,19 +85,19 @@ def fit(
     parametrisation, like = options.parametrisation, options.quantities
     solver = None if options.solver is None else get_solver(options.solver)
     loss = parse_weights(options.weights, options.angles)
-    wide_loss = options.wide_weights if kind == _BRANCH else None
+    wide_loss = options.wide_weights if kind == BRANCH else None
 
     suggestion, result = None, None
     try:
         with terminal_monitor() as monitor:
-            if kind == _AUTO:
+            if kind == AUTO:
                 built, suggestion = _suggest_problem(problem, words, options, parametrisation, loss, monitor)
                 # The fit that confirmed the domain serves if it has the family that is asked for.
                 default = choose_parametrisation(built, True) == choose_parametrisation(built, False)
                 same = parametrisation is not None or default
                 if same and (solver, options.samples, like) == (None,) * 3:
                     result = replace(suggestion.fit, chart=replace(suggestion.fit.chart, problem=built))
-            elif kind == _BRANCH:
+            elif kind == BRANCH:
                 result = _fit_wide(problem, words, options, branch, parametrisation, wide_loss, monitor)
             if result is None:
                 assert built is not None

@@ -10,12 +10,14 @@ from typing import Annotated, Any, cast, get_type_hints
 import numpy as np
 import typer
 
+from orthocas.bases.family import Parametrisation, parse_parametrisation
 from orthocas.cli.output import note
 from orthocas.errors import InvalidValueError, OptionError, UnknownNameError
 from orthocas.fitting.terms import DEFAULT_WEIGHTS, Angles, Weights
 from orthocas.robots.collisions import Collisions
 from orthocas.robots.robot import Robot
 from orthocas.robots.urdf import find_robot_file, list_robot_files
+from orthocas.tasks.corridor import RADIUS
 from orthocas.tasks.domains import default_box
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.regular_box import regular_box
@@ -319,3 +321,99 @@ def parse_weights(text: str, angles: str | None) -> Weights:
     for name, _, value in (word.partition("=") for word in words if "=" in word):
         extra[name.strip()] = float(parse_numbers(f"--weights {name}", value)[0])
     return replace(Weights.of(numbers) if numbers else Weights(), extra=extra, angles=cast(Angles | None, angles))
+
+
+AUTO, BRANCH, ALL = "auto", "branch", "all"  #: words of --domain
+_IN_CORRIDOR = "polynomial:3:cyclic"  # more terms gain little there
+_PARAM = (
+    "Parametrisation: polynomial:5, polynomial:5:cyclic, polynomial:4:joints=2, fourier:2, mlp:64x64, mlp:64x64:raw, "
+    "linear or sew; default: polynomial:5, or polynomial:4 for more than seven joints; polynomial:3:cyclic with "
+    "--corridor; what is regular on the branch with --domain branch."
+)
+_SOLVER = "gauss_newton, quasi_newton, lbfgs, ipopt, adam or gradient_flow; default: what suits the parametrisation."
+_DOMAIN = (
+    "auto: the widest box around the home on which the fit keeps --leak-deg and --conditioning; branch: all of the "
+    "home's branch of the joint range (a wide chart); branch:NAME: of another one, see orthocas info --branches; all: "
+    "a chart of every branch, in an arm file for orthocas solve and oc.Arm."
+)
+_LIKE = "What the first coordinates are like: a joint or swivel; several: NAME,NAME."
+_EXACT = "With --domain branch: they are what --like says itself, on the part of the branch where that can be."
+_CORRIDOR = (
+    "Domain: the surroundings of a path of postures, one a line, with the joint names in the first line; their radius "
+    f"is --half-width [rad], default {RADIUS:g}."
+)
+_LEAK = "Largest leak for --domain auto [deg]; default 8."
+_CONDITIONING = "Smallest conditioning for --domain auto; default 0.2."
+_LOSS = (
+    '"lambda1,lambda2", up to lambda5; "NAME=WEIGHT" for terms of your own. With --domain branch the first two weigh '
+    "leaks and mutual angles, and its own weights are the default."
+)
+_ANGLES = (
+    "Angles in the loss: paper (Euclidean norms) or metric; default: metric with --metric inertia and for tasks that "
+    "turn the tool."
+)
+_AVOID = "With --domain branch: be regular where the robot does not hit itself, by the solids of this file."
+
+
+@dataclass(frozen=True)
+class FitOptions(SolidOptions):
+    """The options of a fit, beside those that describe its problem."""
+
+    param: Annotated[str | None, typer.Option("--param", help=_PARAM)] = None
+    solver: Annotated[str | None, typer.Option("--solver", help=_SOLVER)] = None
+    domain: Annotated[str | None, typer.Option("--domain", help=_DOMAIN)] = None
+    like: Annotated[str | None, typer.Option("--like", help=_LIKE)] = None
+    exact: Annotated[bool, typer.Option("--exact", help=_EXACT)] = False
+    corridor: Annotated[Path | None, typer.Option("--corridor", metavar="POSTURES.csv", help=_CORRIDOR)] = None
+    leak_deg: Annotated[float | None, Number("--leak-deg", help=_LEAK)] = None
+    conditioning: Annotated[float | None, Number("--conditioning", help=_CONDITIONING)] = None
+    samples: SampleCount = None
+    seed: Annotated[int, Whole("--seed", help="Seed of the samples and of random starts.")] = 0
+    weights: Annotated[str, typer.Option("--weights", help=_LOSS)] = WEIGHTS_TEXT
+    angles: Annotated[str | None, typer.Option("--angles", help=_ANGLES)] = None
+    collisions: Annotated[str | None, typer.Option("--collisions", metavar="FILE.urdf|NAME", help=_AVOID)] = None
+
+    @property
+    def parametrisation(self) -> Parametrisation | None:
+        """That of --param, or of a corridor."""
+        param = _IN_CORRIDOR if self.param is None and self.corridor is not None else self.param
+        return None if param is None else parse_parametrisation(param)
+
+    @property
+    def quantities(self) -> str | list[str] | None:
+        """The name, or several, of --like."""
+        names = [word.strip() for word in (self.like or "").split(",")]
+        return None if self.like is None else names[0] if len(names) == 1 else names
+
+    @property
+    def wide_weights(self) -> Weights | Mapping[str, float] | None:
+        """Weights of a wide fit: numbers take the place of its own weights, terms by name alone join these."""
+        numbers = self.weights != WEIGHTS_TEXT and any("=" not in word for word in self.weights.split(","))
+        if self.angles is not None and not numbers:
+            raise OptionError(
+                "--angles requires the numbers of --weights with --domain branch, such as --weights 12,0.3"
+            )
+        if self.weights == WEIGHTS_TEXT:
+            return None
+        weights = parse_weights(self.weights, self.angles)
+        return weights if numbers else weights.extra
+
+    def parse_domain(self) -> tuple[str, str]:
+        """The kind of a domain, and the name of its branch; raises OptionError for options of another kind."""
+        kind, _, branch = (self.domain or "").partition(":")
+        if self.domain is not None and self.corridor is not None:
+            raise OptionError("--corridor is a domain: leave out --domain")
+        if kind != AUTO:
+            for option, value in (("leak-deg", self.leak_deg), ("conditioning", self.conditioning)):
+                if value is not None:
+                    raise OptionError(f"--{option} requires --domain auto")
+        if self.domain not in (None, AUTO) and kind != BRANCH:
+            want = "auto, branch, branch:NAME, all, or --centre and --half-width for a box of your own"
+            raise InvalidValueError("--domain", repr(self.domain), want)
+        if kind != BRANCH and (self.collisions, self.srdf) != (None, None):
+            raise OptionError("--collisions requires --domain branch")
+        if self.exact and (kind != BRANCH or self.like is None):
+            raise OptionError("--exact requires --domain branch and --like")
+        if kind == BRANCH and self.solver is not None:
+            raise OptionError("--domain branch has a solver of its own: leave out --solver")
+        return kind, branch.strip()

@@ -35,16 +35,6 @@ _PORT = "0: any free one. HOST: the address to listen at; 0.0.0.0 is open to the
 _RUN = "trajectory.npz"  # in the folders of `orthocas simulate`
 
 
-@dataclass(frozen=True)
-class _Scene:
-    """What the page shows, and whose it is."""
-
-    shown: Any
-    robot: Robot | Chart | None
-    meshes: Path | None
-    locked: dict[str, float]
-
-
 @spread("words", ProblemOptions, "tip", "lock")
 @spread("solids", SolidOptions)
 def view(
@@ -120,6 +110,16 @@ def view(
         else:
             print_rows({"page": page.url, "open to": only if local else others, "end": "Ctrl-C"})
         page.wait()
+
+
+@dataclass(frozen=True)
+class _Scene:
+    """What the page shows, and whose it is."""
+
+    shown: Any
+    robot: Robot | Chart | None
+    meshes: Path | None
+    locked: dict[str, float]
 
 
 def _read_scene(target: str, chart: Path | None, meshes: Path | None, words: ProblemOptions) -> _Scene:

@@ -11,7 +11,7 @@ import numpy as np
 
 from orthocas.charts.walls import RULES as CLEARANCE
 from orthocas.codegen.export_forms import Form, write_function
-from orthocas.codegen.rendering import Precision, clean_word, clean_words, render
+from orthocas.codegen.rendering import Precision, clean_word, render
 from orthocas.robots.capsules import FittedCapsules
 from orthocas.robots.collisions import Collisions
 from orthocas.robots.kinematics import build_body_poses
@@ -78,8 +78,13 @@ def render_distance(fitted: FittedCapsules, values: Mapping[str, Any], precision
         first, second = model.pairs[number]
         kind, place = numbers[second]
         (plane_pairs if kind == "plane" else pairs).append((numbers[first][1], place, number))
-    # A float more than a radius in double.
-    up = (lambda value: value) if precision.scalar is np.float64 else lambda value: _round_up(value, precision)
+
+    def up(value: float) -> float:
+        # The next larger float than a radius in double, and what the rounding of places adds.
+        if precision.scalar is np.float64:
+            return value
+        return float(precision.next_above(np.array([value * (1 + 4 * precision.rounding)]))[0])
+
     for item in (*capsules, *links):
         item["radius"] = up(item["radius"])
     for capsule in capsules:
@@ -91,7 +96,7 @@ def render_distance(fitted: FittedCapsules, values: Mapping[str, Any], precision
         "missing": clean_word(listed(model.missing)) if model.missing else "",
         "dropped": clean_word(listed([f"{a} and {b}" for a, b in fitted.dropped])) if fitted.dropped else "",
         "pair_count": len(model.pairs),
-        "names": [[_quote(name) for name in pair] for pair in model.pairs],
+        "names": [[clean_word(name).replace('"', "'") for name in pair] for pair in model.pairs],
         "parents": tree.parents,
         "slides": [int(slides) for slides in tree.prismatic],
         "rotations": [rotation.ravel() for rotation in tree.rotations],
@@ -196,13 +201,3 @@ def _order_pairs(model: Collisions) -> list[int]:
         places = {pair: k for k, pair in enumerate(model.pairs)}
         np.add.at(counts, [places[pair] for pair in near], 1)
     return [int(k) for k in np.argsort(-counts, kind="stable")]
-
-
-def _round_up(value: float, precision: Precision) -> float:
-    """The next larger number of a type, and what the rounding of places adds."""
-    return float(precision.next_above(np.array([value * (1 + 4 * precision.rounding)]))[0])
-
-
-def _quote(name: str) -> str:
-    """A name within a string of C."""
-    return clean_words([name])[0].replace('"', "'")

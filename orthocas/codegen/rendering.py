@@ -15,14 +15,14 @@ import numpy as np
 
 from orthocas.charts.trackers import RULES, ReachingRules
 from orthocas.control.controller import LARGEST, SMALLEST_VOLUME, Controller, replace_smallest_volume
-from orthocas.native import rendering
+from orthocas.native import kernels
 from orthocas.tasks.domains import Domain
 from orthocas.tools.checks import Array
 from orthocas.version import VERSION
 
 # Templates and C files of this package.
-render = partial(rendering.render, package=__package__)
-get_source = partial(rendering.get_source, package=__package__)
+render = partial(kernels.render, package=__package__)
+get_source = partial(kernels.get_source, package=__package__)
 
 # 1e+06 becomes 1e6, and 1e-05 1e-5.
 _EXPONENT = re.compile(r"e\+?(-?)0*")

@@ -11,7 +11,7 @@ from orthocas.codegen.rendering import clean_word, clean_words
 from orthocas.control.controller import Controller
 from orthocas.control.memory import find_memory
 from orthocas.control.safety import TORQUE_ONLY, Safety
-from orthocas.native.rendering import write_number, write_numbers
+from orthocas.native.kernels import write_number, write_numbers
 from orthocas.tasks.domains import Domain
 from orthocas.tasks.relative import Relative
 from orthocas.tasks.samples import sample_uniform

@@ -11,10 +11,11 @@ import numpy as np
 from orthocas.charts.chart import Chart
 from orthocas.control.reference import Reference, joint_path
 from orthocas.errors import InvalidValueError
+from orthocas.robots.tree import require_driven
 from orthocas.tasks.domains import Domain
 from orthocas.tasks.problem import Problem
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array, require_known
+from orthocas.tools.checks import Array, require_kind, require_known
 from orthocas.tools.display import Shown, listed, number_list
 from orthocas.tools.expressions import wrap_shortest
 
@@ -242,6 +243,13 @@ class LawOfChart(Shown):
     def require_reachable(self, reference: Reference, q_start: Array) -> None:
         """Raise UnreachableReferenceError if the motion from q_start along the reference leaves the chart's domain."""
         joint_path(self.chart, reference, q_start)
+
+
+def require_chart(chart: Chart, user: str) -> None:
+    """Raise InvalidValueError for other objects, RobotError for a floating base, NoExpressionError for grown charts."""
+    require_kind("chart", chart, Chart)
+    require_driven(user, chart.problem.robot.tree)
+    chart.function("xi")
 
 
 def require_controller(controller: Controller) -> None:

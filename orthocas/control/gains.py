@@ -22,6 +22,7 @@ from orthocas.tools.checks import (
     as_number,
     as_point_set,
     freeze_array,
+    require_at_least,
     require_kind,
     require_shape,
 )
@@ -98,9 +99,7 @@ def find_fastest_frequency(delay: float, damping_ratio: ArrayLike, chart: Chart)
     Raises:
         InvalidValueError: for other delays, and a damping ratio that leaves less than 30 deg without any delay.
     """
-    if not 0 <= as_number("delay", delay) < np.inf:
-        raise InvalidValueError("delay", delay, "a finite number >= 0")
-    if not delay:
+    if not require_at_least("delay", delay, 0):
         return float(np.inf)
     # At the crossing a omega, the phase of (2 zeta omega s + omega^2) exp(-s T) / s^2 is atan(2 zeta a) - a omega T.
     ratio = float(positive_gains("damping_ratio", damping_ratio, chart.n).min())

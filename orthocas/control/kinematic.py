@@ -21,13 +21,13 @@ from orthocas.control.controller import (
     fallback_function,
     guarded_graph,
     named_inputs,
+    require_chart,
 )
 from orthocas.control.gains import FEEDBACK, LIMIT, RULES, command_limit, non_negative_gains
 from orthocas.control.linear_algebra import build_block_inertia, compute_median_volume
 from orthocas.errors import InvalidValueError
-from orthocas.robots.tree import require_driven
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array, as_float_array, require_at_least, require_kind, require_shape
+from orthocas.tools.checks import Array, as_float_array, require_at_least, require_shape
 from orthocas.tools.display import Shown, listed, number_list
 from orthocas.tools.expressions import wrap_shortest
 
@@ -66,10 +66,7 @@ class Kinematic(LawOfChart):
     options: ClassVar[Mapping[str, Setting]] = {"feedback": Setting("Feedback gain [1/s]; default: 10.")}
 
     def __init__(self, chart: Chart, feedback: ArrayLike = RULES.feedback, limit: ArrayLike | None = None) -> None:
-        require_kind("chart", chart, Chart)
-        require_driven(f"the law {self.name}", chart.problem.robot.tree)
-        # Grown charts raise here.
-        chart.function("xi")
+        require_chart(chart, f"the law {self.name}")
         object.__setattr__(self, "chart", chart)
         object.__setattr__(self, "feedback", non_negative_gains("feedback", feedback, chart.n))
         object.__setattr__(self, "limit", command_limit("limit", limit, chart.problem.robot.velocity_limits))
@@ -145,17 +142,13 @@ class XiTask(Shown):
         lm_damping: float = 0.0,
         joints: tuple[str, ...] | None = None,
     ) -> None:
-        require_kind("chart", chart, Chart)
-        require_driven("a task of a quadratic program", chart.problem.robot.tree)
-        # Grown charts raise here.
-        chart.function("xi")
-        require_at_least("gain", gain, 0)
-        require_at_least("lm_damping", lm_damping, 0)
+        require_chart(chart, "a task of a quadratic program")
+        self.gain = require_at_least("gain", gain, 0)
+        self.lm_damping = require_at_least("lm_damping", lm_damping, 0)
         if gain > 1:
             raise InvalidValueError("gain", gain, "a number from 0 to 1")
         self.chart = chart
         self.cost = non_negative_gains("cost", cost, chart.r)
-        self.gain, self.lm_damping = float(gain), float(lm_damping)
         self.joints = chart.problem.robot.joint_names if joints is None else tuple(joints)
         require_shape("joints", (len(self.joints),), (chart.n,))
         self.target_xi: Array | None = None

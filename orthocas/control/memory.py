@@ -34,6 +34,7 @@ from orthocas.tools.checks import (
     as_point,
     require_finite,
     require_kind,
+    require_positive,
     require_shape,
 )
 from orthocas.tools.display import Shown, number_list
@@ -234,8 +235,7 @@ class _Correcting:
     bound: ArrayLike | None = None
 
     def __post_init__(self) -> None:
-        if not 0 < as_number("rate", self.rate) < np.inf:
-            raise InvalidValueError("rate", self.rate, "a finite number > 0")
+        require_positive("rate", self.rate)
         if self.bound is not None:
             as_float_array("bound", self.bound)
 

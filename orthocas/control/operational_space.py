@@ -24,6 +24,7 @@ from orthocas.control.controller import (
     fallback_function,
     guarded_graph,
     named_inputs,
+    require_chart,
 )
 from orthocas.control.gains import (
     COMPLIANCE,
@@ -55,7 +56,6 @@ from orthocas.control.memory import MEMORIES, Memory, Remembers
 from orthocas.control.run_time_model import UNITS, Gravity, RunTimeModel, Source
 from orthocas.errors import InvalidValueError, LawWarning, warn_caller
 from orthocas.robots.robot import Robot
-from orthocas.robots.tree import require_driven
 from orthocas.tasks.metric import Metric
 from orthocas.tasks.samples import sample_uniform
 from orthocas.tools.batch import Batched
@@ -181,8 +181,7 @@ class _OperationalSpace(LawOfChart):
     ) -> None:
         require_known("coupling", coupling, get_args(Coupling))
         require_known("damping", damping, DAMPING_DESIGNS)
-        require_kind("chart", chart, Chart)
-        require_driven(f"the law {self.name}", chart.problem.robot.tree)
+        require_chart(chart, f"the law {self.name}")
         model = RunTimeModel() if model is None else model
         require_kind("model", model, RunTimeModel)
         if isinstance(remembers, str):
@@ -194,8 +193,7 @@ class _OperationalSpace(LawOfChart):
             )
         if remembers is not None and model.extra_torque is None:
             model = replace(model, extra_torque=0.0)
-        # Grown charts, and values of another size, raise here.
-        chart.function("xi")
+        # Values of another size raise here.
         n, as_stiffness = chart.n, damping_stiffness is None
         if damping_stiffness is not None:
             damping_stiffness = positive_gains("damping_stiffness", damping_stiffness, n)

@@ -17,11 +17,11 @@ from numpy.typing import ArrayLike
 from orthocas.charts.chart import Chart
 from orthocas.charts.self_motion import too_far
 from orthocas.charts.trackers import Tracker, TrackerStatus
+from orthocas.control.gains import positive_gains
 from orthocas.errors import (
     InvalidValueError,
     InverseError,
     OrthocasError,
-    ShapeError,
     UnreachableReferenceError,
     degrees_hint,
 )
@@ -29,13 +29,14 @@ from orthocas.tools.batch import Batched, dense_function
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import (
     Array,
-    as_float_array,
+    as_number,
     as_point,
     freeze_array,
     import_extra,
+    require_at_least,
     require_kind,
     require_known,
-    require_shape,
+    require_positive,
 )
 from orthocas.tools.display import Shown, listed, number_list
 
@@ -105,9 +106,9 @@ class Reference(Shown):
         """
         names = _check_names(labels)
         value = freeze_array("start", start, (len(labels),))
-        omega0 = _require_number("natural_frequency", natural_frequency, above=0.0)
-        _require_number("duration", duration, above=0.0)
-        zeta = _require_number("damping_ratio", damping_ratio, above=-np.finfo(float).tiny)
+        omega0 = require_positive("natural_frequency", natural_frequency)
+        require_positive("duration", duration)
+        zeta = require_at_least("damping_ratio", damping_ratio, 0)
         times, targets = _build_stairs(names, value, changes, duration)
         # Each segment starts where the one before ends.
         profile = build_low_pass(len(names), omega0, zeta)
@@ -177,8 +178,8 @@ class Reference(Shown):
         if len(values) < 2:
             raise InvalidValueError("number of points", len(values), "at least 2")
         limits = {"velocity": velocity, "acceleration": acceleration, "jerk": jerk}
-        sizes = {name: _read_limit(name, limit, len(names)) for name, limit in limits.items()}
-        _require_number("pause", pause, above=-np.finfo(float).tiny)
+        sizes = {name: positive_gains(name, limit, len(names)) for name, limit in limits.items()}
+        require_at_least("pause", pause, 0)
         times, targets, coefficients = [0.0], [], []
         for start, end in pairwise(values):
             # Between its corners, the way is cubic; a pause is a way that stays.
@@ -286,16 +287,6 @@ def _build_polynomial(k: int) -> ca.Function:
     return dense_function("spline", [t, coefficients], [value, velocity, ca.jacobian(velocity, t)])
 
 
-def _read_limit(name: str, limit: ArrayLike, k: int) -> Array:
-    """One limit for each of k quantities."""
-    numbers = as_float_array(name, limit)
-    if numbers.shape not in ((), (k,)):
-        raise ShapeError(name, numbers.shape, (k,))
-    if not (np.isfinite(numbers) & (numbers > 0)).all():
-        raise InvalidValueError(name, numbers.tolist(), "finite numbers > 0")
-    return np.broadcast_to(numbers, (k,))
-
-
 def _plan_way(start: Array, end: Array, limits: Mapping[str, Array]) -> tuple[list[float], list[Array]]:
     """Corners in time of the way from rest to rest, and before each the coefficients (k, 6), highest power first."""
     ruckig: Any = import_extra("ruckig", "a jerk-limited reference", "jerk")
@@ -341,14 +332,14 @@ def _build_stairs(
         if not isinstance(change, Sequence) or len(change) != 2:
             raise InvalidValueError("an entry of changes", repr(change)[:80], "a time and targets, (0.5, {'x': 0.1})")
         time, moves = change
-        at = _require_number("time of a step", time)
+        at = as_number("time of a step", time)
         if not times[-1] <= at < duration:
             raise InvalidValueError("time of a step", at, f"from {times[-1]:g} to below the duration {duration:g} s")
         target = targets[-1].copy()
         require_kind("targets of a step", moves, Mapping)
         for label, value in moves.items():
             require_known("quantity", label, labels)
-            target[labels.index(label)] = _require_number(f"target of {label}", value)
+            target[labels.index(label)] = float(freeze_array(f"target of {label}", value, ()))
         # Changes at one time are one step.
         if at == times[-1]:
             targets[-1] = target
@@ -356,16 +347,6 @@ def _build_stairs(
             times.append(at)
             targets.append(target)
     return np.array([*times, float(duration)]), np.array(targets)
-
-
-def _require_number(name: str, value: float, above: float = -np.inf) -> float:
-    array = as_float_array(name, value)
-    require_shape(name, array.shape, ())
-    if not (np.isfinite(array) and array > above):
-        raise InvalidValueError(
-            name, value, "a finite number" if above == -np.inf else f"a finite number > {above:.0f}"
-        )
-    return float(array)
 
 
 def joint_path(chart: Chart, reference: Reference, q_start: ArrayLike) -> Array:

@@ -66,7 +66,7 @@ class RunTimeModel:
         if self.payload is not None:
             if self.source == "given":
                 raise InvalidValueError("payload", self.payload, "none, because the given model includes the load")
-            object.__setattr__(self, "payload", check_payload("payload", self.payload))
+            object.__setattr__(self, "payload", check_payload(self.payload))
         if self.wrench is not None:
             object.__setattr__(self, "wrench", freeze_array("wrench", self.wrench, (6,)))
 

@@ -1,22 +1,30 @@
-"""CasADi functions as C kernels, with work arrays on the stack."""
+"""C as text: kernels from CasADi functions, with work arrays on the stack, and templates around them."""
+
+from __future__ import annotations
 
 import re
 from collections import Counter
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Iterable, Mapping
 from dataclasses import dataclass
-from functools import partial
+from functools import cache, partial
+from importlib.resources import files
 from itertools import pairwise
+from typing import TYPE_CHECKING, Any
 
 import casadi as ca
 import numpy as np
 
 from orthocas.errors import CompileError
-from orthocas.native.rendering import render
+
+if TYPE_CHECKING:
+    from jinja2 import Environment
+    from jinja2.runtime import Context
 
 LARGE_INVERSE = "large_inverse"  #: name of the functions for which generated C has code of its own
 ROOT_TIMES = "root_times"  #: likewise
 ROUNDS = 8  #: accurate to rounding up to a condition number of 1e6 (tests/control/test_control_algebra.py)
 
+_INFINITIES = {np.inf: "INFINITY", -np.inf: "-INFINITY"}
 _VERSION = f"by CasADi {ca.CasadiMeta.version()}"
 _PLACE = re.compile(r"\*w(\d+)=w\+(\d+)")
 _CALL = re.compile(r"\bcasadi_f\d+(?=\(arg1, res1, iw, w, 0\))")
@@ -427,3 +435,53 @@ def _take_sines(function: ca.Function) -> ca.Function | None:
             work[into[0]] = (ca.SX.unary if len(of) == 1 else ca.SX.binary)(code, *(work[place] for place in of))
     output = ca.SX(function.sparsity_out(0), ca.vertcat(*(entries[k] for k in range(len(entries)))))
     return ca.Function(function.name(), [*turns.values(), *inputs], [output]) if has_turns else None
+
+
+def render(template: str, values: Mapping[str, Any], package: str = __package__) -> str:
+    """The text of `templates/TEMPLATE.jinja` of a package. A name that the values lack is an error."""
+    return _environment(package).get_template(f"{template}.jinja").render(values)
+
+
+def get_source(name: str, package: str = __package__) -> str:
+    """A C file of a package's `runtime/` as it is."""
+    return (files(package) / "runtime" / name).read_text()
+
+
+@cache
+def _environment(package: str) -> Environment:
+    """Blocks vanish with their lines; `x | numbers` are literals of C, `x | array` and `x | strings` initialisers."""
+    from jinja2 import Environment, PackageLoader, StrictUndefined, pass_context  # charts load without it
+
+    # Missing names are errors, and generated text is not HTML.
+    environment = Environment(
+        loader=PackageLoader(package, "templates"),
+        undefined=StrictUndefined,
+        keep_trailing_newline=True,
+        trim_blocks=True,
+        lstrip_blocks=True,
+        autoescape=False,
+    )
+    environment.filters |= {"numbers": write_numbers, "array": lambda values: f"{{{write_numbers(values)}}}"}
+    environment.filters["strings"] = lambda words: f"{{{', '.join(map(_quote, words))}}}"
+
+    # Python for NumPy as that of the template's library.
+    def translate(context: Context, text: str) -> str:
+        return str(context["library"].translate(text))
+
+    environment.filters["code"] = pass_context(translate)
+    return environment
+
+
+def _quote(word: str) -> str:
+    """A string of C; a quote in it would end it."""
+    return '"' + word.replace('"', "'") + '"'
+
+
+def write_numbers(values: Iterable[Any]) -> str:
+    """C literals, with commas between, that convert back to exactly the same numbers; 0 and 1 for truth values."""
+    return ", ".join(map(write_number, np.ravel(np.asarray(values)).tolist()))
+
+
+def write_number(value: float) -> str:
+    """A C literal; whole numbers stay whole."""
+    return str(int(value)) if isinstance(value, int) else _INFINITIES.get(value, repr(float(value)))

@@ -12,14 +12,12 @@ from orthocas.bases.products import Polynomial
 from orthocas.charts.chart import Chart
 from orthocas.errors import DomainError, InvalidValueError
 from orthocas.fitting.fit import fit
-from orthocas.tasks.corridor import Corridor
+from orthocas.tasks.corridor import RADIUS, Corridor
 from orthocas.tasks.domains import Box
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.regular_box import find_joint_range
 from orthocas.tasks.samples import find_idle_joints, sample_problem
 from orthocas.tools.checks import Array, as_number, as_point_set, require_kind
-
-RADIUS = 0.2  #: [rad]
 
 
 @dataclass(frozen=True, slots=True)

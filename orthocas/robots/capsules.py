@@ -348,9 +348,9 @@ def _measure_hull(corners: Array) -> float:
     return float(scipy.spatial.ConvexHull(corners, qhull_options="QJ").volume) if len(corners) > 3 else 0.0
 
 
-def _measure_union(solids: Sequence[Shape | Capsule], count: int = RULES.points) -> float:
+def _measure_union(solids: Sequence[Shape | Capsule]) -> float:
     """The volume of a union, by seeded points in a box around each solid, weighed by how many solids hold them."""
-    rng, total = np.random.default_rng(RULES.seed), 0.0
+    rng, count, total = np.random.default_rng(RULES.seed), RULES.points, 0.0
     low, high = (np.array(corners) for corners in zip(*(solid.list_box() for solid in solids), strict=True))
     for k, solid in enumerate(solids):
         points = rng.uniform(low[k], high[k], (count, 3))

@@ -305,37 +305,36 @@ def _regroup(tree: KinematicTree) -> list[_Body]:
     return bodies
 
 
-def check_payload(name: str, value: ArrayLike) -> Array:
+def check_payload(value: ArrayLike) -> Array:
     """The ten numbers of a payload, read-only.
 
     Args:
-        name: for messages.
         value: mass [kg] of a point at the tip, (4,) with its centre in the tip frame [m], or (10,) with the inertia
             about that centre, in axes of the tip frame: Ixx, Ixy, Ixz, Iyy, Iyz, Izz [kg m^2].
 
     Raises:
         InvalidValueError: for another form, a negative mass, or an inertia that no body has.
     """
-    values = np.atleast_1d(as_float_array(name, value))
+    values = np.atleast_1d(as_float_array("payload", value))
     if values.shape not in ((1,), (4,), (PAYLOAD,)):
-        raise InvalidValueError(f"shape of {name}", values.shape, _FORMS)
-    require_finite(name, values)
+        raise InvalidValueError("shape of payload", values.shape, _FORMS)
+    require_finite("payload", values)
     # Missing numbers are 0: a point mass at the tip, or one elsewhere.
     numbers = np.zeros(PAYLOAD)
     numbers[: len(values)] = values
     if numbers[0] < 0:
-        raise InvalidValueError(f"mass of {name}", numbers[0], "a mass >= 0")
+        raise InvalidValueError("mass of payload", numbers[0], "a mass >= 0")
     inertia = numbers[4:][_MATRIX].reshape(3, 3)
     smallest = float(np.linalg.eigvalsh(inertia)[0])
     if smallest < -_INDEFINITE * np.abs(inertia).max():
-        raise InvalidValueError(f"smallest principal inertia of {name}", smallest, "a number >= 0")
+        raise InvalidValueError("smallest principal inertia of payload", smallest, "a number >= 0")
     numbers.setflags(write=False)
     return numbers
 
 
 def add_payload(tree: KinematicTree, payload: ArrayLike) -> KinematicTree:
     """The tree with a payload merged into the body that carries the tip; unchanged if that is the base."""
-    numbers, i = check_payload("payload", payload), tree.tip_parent
+    numbers, i = check_payload(payload), tree.tip_parent
     mass, centre, inertia = tree.masses[i], tree.centres[i], tree.inertias[i]
     total = mass + numbers[0]
     if i < 0 or total == 0:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Collection, Mapping, Sequence
 from dataclasses import dataclass
-from math import inf, isfinite
+from math import ceil, inf, isfinite
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -20,7 +20,16 @@ from orthocas.errors import InvalidValueError, OrthocasError, StepsFileError
 from orthocas.robots.kinematics import build_point_jacobian
 from orthocas.robots.tree import KinematicTree
 from orthocas.tools.cached import cached_property
-from orthocas.tools.checks import Array, as_float_array, freeze_array, require_count, require_known, require_shape
+from orthocas.tools.checks import (
+    Array,
+    as_number,
+    freeze_array,
+    require_at_least,
+    require_count,
+    require_known,
+    require_positive,
+    require_shape,
+)
 from orthocas.tools.json import read_strict_json
 
 Link = str | int | None  #: a link, by the joint that moves it (name or index), or a frame by its name; None: the tip
@@ -36,6 +45,7 @@ class SimulationRules:
     outputs: int = 25  #: instants a call of an integrator: one integrator serves all, and Ctrl-C waits for one call
     ticks: int = 50  #: a call, for the same reason
     same_time: float = 1e-9  #: events closer than this differ only by rounding [s]
+    most_steps: int = 100_000  #: of the physics in a tick, about 5 s of computing
     most_ticks: float = 1e7  #: of a sampled run
     most_instants: float = 1e6  #: of a run that is read from a file
     shortest: float = 1e-3  #: time between points, and length of a run or a push [s]
@@ -90,6 +100,17 @@ def require_link(link: object, n: int | None = None) -> None:
         raise InvalidValueError("link", repr(link)[:80], f"the name of a joint, or the index of one{most}")
 
 
+def count_steps(seconds: float, longest: float) -> int:
+    """The number of equal steps of the physics in a tick [s], none longer than a length [s].
+
+    A tick that is a whole number of such steps, but for rounding, gets no further one.
+    """
+    count = as_number("seconds", seconds) / longest - 1e-9
+    if not -1e-9 < count <= RULES.most_steps:
+        raise InvalidValueError("seconds", seconds, f"a number > 0, at most {RULES.most_steps * longest:g}")
+    return max(1, ceil(count))
+
+
 @dataclass(frozen=True, eq=False)
 class Push:
     """An external load that is constant for some time.
@@ -122,13 +143,8 @@ class Push:
         point: ArrayLike = (0.0, 0.0, 0.0),
     ) -> None:
         # Two instants, then forces, and where the force acts.
-        for name, value, want in (("start", start, ">= 0"), ("duration", duration, "> 0")):
-            number = as_float_array(f"{name} of a push", value)
-            require_shape(f"{name} of a push", number.shape, ())
-            if not (np.isfinite(number) and (number > 0 or (number == 0 and name == "start"))):
-                raise InvalidValueError(f"{name} of a push", value, f"a finite number {want}")
-        object.__setattr__(self, "start", float(start))
-        object.__setattr__(self, "duration", float(duration))
+        object.__setattr__(self, "start", require_at_least("start of a push", start, 0))
+        object.__setattr__(self, "duration", require_positive("duration of a push", duration))
         object.__setattr__(self, "force", freeze_array("force", force, (3,)))
         object.__setattr__(self, "torque", None if torque is None else freeze_array("torque", torque, (None,)))
         require_link(link)
@@ -230,9 +246,7 @@ class Noise:
     def __post_init__(self) -> None:
         require_count("seed", self.seed, least=0)
         for name in ("position", "velocity"):
-            value = as_float_array(f"{name} noise", getattr(self, name))
-            if value.shape or not (np.isfinite(value) and value >= 0):
-                raise InvalidValueError(f"{name} noise", getattr(self, name), "a finite number >= 0")
+            require_at_least(f"{name} noise", getattr(self, name), 0)
 
     def sample(self, ticks: int, n: int) -> Array:
         """Measurement errors of q and dq, (ticks, 2 n)."""

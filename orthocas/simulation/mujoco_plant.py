@@ -16,8 +16,17 @@ from orthocas.errors import InvalidValueError, RobotError, SimulationError
 from orthocas.robots.robot import Robot
 from orthocas.robots.spatial import rotate_z_to
 from orthocas.robots.tree import KinematicTree, require_body
-from orthocas.simulation.disturbances import Friction, Link, place_of
-from orthocas.tools.checks import Array, as_number, as_point, freeze_array, import_extra, require_at_least, require_kind
+from orthocas.simulation.disturbances import Friction, Link, count_steps, place_of
+from orthocas.tools.checks import (
+    Array,
+    as_number,
+    as_point,
+    freeze_array,
+    import_extra,
+    require_at_least,
+    require_kind,
+    require_positive,
+)
 from orthocas.tools.display import Shown
 
 MUJOCO = "mujoco"  #: name of this plant
@@ -39,7 +48,6 @@ class MuJoCoRules:
     far: float = 1e9  #: MuJoCo's ranges have two ends [rad] or [m]
     most_parts: int = 8  #: of the longest step, for RK4
     largest: float = 1e10  #: torque [N m] or [N]
-    most_steps: int = 100_000  #: of the physics in a tick, about 5 s of computing
     runaway: float = 1e6  #: velocity [rad/s] or [m/s]
 
 
@@ -66,8 +74,7 @@ class Payload:
     def __init__(
         self, mass: float, centre: ArrayLike = (0.0, 0.0, 0.0), inertia: ArrayLike = ((0.0,) * 3,) * 3
     ) -> None:
-        require_at_least("mass of a payload", mass, 0.0)
-        object.__setattr__(self, "mass", as_number("mass of a payload", mass))
+        object.__setattr__(self, "mass", require_at_least("mass of a payload", mass, 0.0))
         object.__setattr__(self, "centre", freeze_array("centre of a payload", centre, (3,)))
         object.__setattr__(self, "inertia", freeze_array("inertia of a payload", inertia, (3, 3)))
         require_body("tip", self.mass, self.inertia, 0.0)
@@ -100,8 +107,7 @@ class Wall:
             raise InvalidValueError("normal of a wall", normal.tolist(), "a direction other than zero")
         object.__setattr__(self, "normal", freeze_array("normal", normal / np.linalg.norm(normal), (3,)))
         for name in ("tip_radius", "size", "thickness", "time_constant"):
-            if not 0 < as_number(f"{name} of a wall", getattr(self, name)) < np.inf:
-                raise InvalidValueError(f"{name} of a wall", getattr(self, name), "a finite number > 0")
+            require_positive(f"{name} of a wall", getattr(self, name))
 
 
 @dataclass(frozen=True, eq=False)
@@ -547,11 +553,7 @@ class MuJoCoPlant(Shown):
         data = self.data
         data.ctrl[:] = self._check("torque", torque)
         data.qfrc_applied[self._dofs] = 0.0 if loads is None else self._check("loads", loads)
-        # Equal steps of the physics. A tick that is a whole number of steps, but for rounding, gets no further one.
-        count = as_number("seconds", seconds) / self._longest - 1e-9
-        if not -1e-9 < count <= RULES.most_steps:
-            raise InvalidValueError("seconds", seconds, f"a number > 0, at most {RULES.most_steps * self._longest:g}")
-        steps = max(1, ceil(count))
+        steps = count_steps(seconds, self._longest)
         self.model.opt.timestep = seconds / steps
         self._step(self.model, data, steps)
         if not data.qvel @ data.qvel < RULES.runaway**2:

@@ -19,12 +19,21 @@ from orthocas.control.safety import Safety
 from orthocas.errors import Interrupted, InvalidValueError, SimulationError
 from orthocas.robots.robot import Robot
 from orthocas.simulation.disturbances import RULES, Friction, Loads, Noise, Push, Stops
-from orthocas.simulation.loops import ClosedLoop, CompiledLoop, Piece, integrate, run_ticks
+from orthocas.simulation.loops import (
+    ClosedLoop,
+    CompiledLoop,
+    LawWithMemory,
+    Piece,
+    SupervisedLaw,
+    integrate,
+    run_physics,
+    run_supervised,
+    run_ticks,
+)
 from orthocas.simulation.mujoco_plant import MUJOCO, MuJoCo
-from orthocas.simulation.physics import LawWithMemory, SupervisedLaw, run_physics, run_supervised
 from orthocas.simulation.trajectory import Outcome, Trajectory, find_loss
 from orthocas.tools.batch import THREADS, Batched
-from orthocas.tools.checks import Array, as_number, as_point, require_executor, require_kind, require_known
+from orthocas.tools.checks import Array, as_point, require_executor, require_kind, require_known, require_positive
 from orthocas.tools.expressions import wrap_shortest
 from orthocas.tools.progress import Monitor, Progress, silent
 
@@ -212,8 +221,8 @@ def _check_settings(loop: ClosedLoop, reference: Reference, settings: Settings, 
     """Raise InvalidValueError for arguments that would be ignored, or fail later with a less clear message."""
     rate, end, law = settings.control_rate, reference.duration, loop.controller
     for name, value in (("step", settings.step), ("tolerance", settings.tolerance), ("control_rate", rate)):
-        if value is not None and not 0 < as_number(name, value) < np.inf:
-            raise InvalidValueError(name, value, "a finite number > 0")
+        if value is not None:
+            require_positive(name, value)
     require_kind("compiled", settings.compiled, bool)
     sampled, in_mujoco, remembers = rate is not None, scene is not None, find_memory(law) is not None
     forces = bool(loop.loads.pushes) or settings.friction is not None or loop.stops is not None

@@ -3,17 +3,16 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from math import ceil
 
 import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.errors import InvalidValueError, SimulationError
+from orthocas.errors import SimulationError
 from orthocas.robots.robot import Robot
-from orthocas.simulation.disturbances import Friction
+from orthocas.simulation.disturbances import Friction, count_steps
 from orthocas.tools.batch import Batched, dense_function
-from orthocas.tools.checks import Array, as_number, as_point, require_kind
+from orthocas.tools.checks import Array, as_point, require_kind, require_positive
 from orthocas.tools.display import Shown
 
 
@@ -22,7 +21,6 @@ class StickingRules:
     """Numbers of the plant that sticks."""
 
     timestep: float = 2.5e-4  #: longest step of the physics [s]
-    most_steps: int = 100_000  #: in a tick
     runaway: float = 1e6  #: velocity [rad/s] or [m/s]
     blocks: int = 10  #: rounds of the pivoting in which all joints change at once; then one by one, which always ends
     rounds: int = 1000  #: of the pivoting, in all
@@ -79,9 +77,7 @@ class StickingPlant(Shown):
         require_kind("robot", robot, Robot)
         friction = Friction() if friction is None else friction
         require_kind("friction", friction, Friction)
-        if not 0 < as_number("timestep", timestep) < np.inf:
-            raise InvalidValueError("timestep", timestep, "a finite number > 0")
-        self.robot, self.friction, self._timestep = robot, friction, float(timestep)
+        self.robot, self.friction, self._timestep = robot, friction, require_positive("timestep", timestep)
         self._viscous, self._coulomb, self._extra, self._speed = np.split(friction.numbers(robot.n), 4)
         self._limit = robot.effort_limits if effort_limits else np.full(robot.n, np.inf)
         q, dq = ca.SX.sym("q", robot.n), ca.SX.sym("dq", robot.n)
@@ -121,10 +117,7 @@ class StickingPlant(Shown):
         applied = np.clip(as_point("torque", torque, self.robot.n), -self._limit, self._limit)
         if loads is not None:
             applied = applied + as_point("loads", loads, self.robot.n)
-        count = as_number("seconds", seconds) / self._timestep - 1e-9
-        if not -1e-9 < count <= RULES.most_steps:
-            raise InvalidValueError("seconds", seconds, f"a number > 0, at most {RULES.most_steps * self._timestep:g}")
-        steps = max(1, ceil(count))
+        steps = count_steps(seconds, self._timestep)
         h, q, dq = seconds / steps, self.q, self.dq
         for _ in range(steps):
             # Mass matrix and bias at the position in the middle, and the friction that goes with the last velocity.

@@ -22,6 +22,7 @@ from orthocas.tools.files import find_columns, read_table
 from orthocas.tools.json import get_part
 
 CORRIDOR = "corridor"  #: name of the kind
+RADIUS = 0.2  #: of the surroundings of a path, by default [rad]
 _MOST_POSTURES = 2000  #: of a path
 _MOST_IN_FILE = 1_000_000  #: postures of a CSV file
 

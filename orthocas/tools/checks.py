@@ -230,7 +230,15 @@ def suggest_attribute(value: object, kind: type) -> str:
     return f": use its attribute '{name}'" if isinstance(getattr(value, name, None), kind) else ""
 
 
-def require_at_least(name: str, value: float, least: float) -> None:
-    """Raise InvalidValueError unless `value` is a finite number >= least."""
-    if not least <= as_number(name, value) < float("inf"):
+def require_at_least(name: str, value: float, least: float) -> float:
+    """The value as a float; raises InvalidValueError unless it is a finite number >= least."""
+    if not least <= (number := as_number(name, value)) < np.inf:
         raise InvalidValueError(name, value, f"a finite number >= {least:g}")
+    return number
+
+
+def require_positive(name: str, value: float) -> float:
+    """The value as a float; raises InvalidValueError unless it is a finite number > 0."""
+    if not 0 < (number := as_number(name, value)) < np.inf:
+        raise InvalidValueError(name, value, "a finite number > 0")
+    return number

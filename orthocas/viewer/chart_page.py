@@ -50,7 +50,7 @@ class ChartPage:
         # The scene, with room for all that the coordinates reach, then what the user moves, then what it shows first.
         robot = session.chart.problem.robot
         self._fans = [fan_along(session.chart, session.home, k) for k in range(session.chart.r)]
-        self._arm, self._ghosts = Arm(server.scene, "/arm", robot, look), Ghosts(server.scene, "/ghosts", robot)
+        self._arm, self._ghosts = Arm(server.scene, "/arm", robot, look), Ghosts(server.scene, robot)
         place_scene(server, robot, np.concatenate([session.home[None], *(fan.spread(5) for fan in self._fans)]))
         self._contacts = None if collisions is None else Contacts(server.scene, collisions)
         self._handle, self._rings = self._add_handle(), self._add_rings()

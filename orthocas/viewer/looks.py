@@ -422,8 +422,8 @@ class Arm:
 class Ghosts:
     """Slim arms at several joint positions, coloured from the first to the last, and lines through their joints."""
 
-    def __init__(self, scene: Any, name: str, robot: Robot) -> None:
-        self._scene, self._name, self._robot = scene, name, robot
+    def __init__(self, scene: Any, robot: Robot) -> None:
+        self._scene, self._robot = scene, robot
         self._poses = BodyPoses(robot.tree)
         self._look = build_stick_arm(robot.tree, RULES.ghost_thickness, RULES.ghost_facets)[1:]
         self._nodes: list[Any] = []
@@ -437,7 +437,7 @@ class Ghosts:
             places = zip(self._look, turns, positions[k, 1:], strict=True)
             ghost = join_solids([solid.move(R, p) for solids, R, p in places for solid in solids], tuple(colour))
             node = self._scene.add_mesh_simple(
-                f"{self._name}/{k}", ghost.vertices, ghost.faces, color=ghost.colour, opacity=0.55, side="front",
+                f"/ghosts/{k}", ghost.vertices, ghost.faces, color=ghost.colour, opacity=0.55, side="front",
                 flat_shading=False, cast_shadow=False, receive_shadow=False,
             )  # fmt: skip
             self._nodes.append(node)
@@ -450,14 +450,14 @@ class Ghosts:
             lines = np.stack([moving[:-1], moving[1:]], axis=2).reshape(-1, 2, 3)
             shade = np.stack([colours[:-1], colours[1:]], axis=2).reshape(-1, 2, 3)
             thickness = RULES.trace * max(size, 1e-3)
-            self._nodes.append(self._scene.add_line_segments(f"{self._name}/traces", lines, shade, thickness=thickness))
+            self._nodes.append(self._scene.add_line_segments("/ghosts/traces", lines, shade, thickness=thickness))
             # At the joint that moves farthest; both texts in one place if the curve comes back.
             way = points[:, int(np.argmax(np.linalg.norm(np.ptp(points, axis=0), axis=1)))]
             if len(ends) == 2 and np.linalg.norm(way[-1] - way[0]) < RULES.same_place * size:
                 ends, way = [f"{ends[0]} and {ends[1]}"], way[:1]
             for k, (text, place) in enumerate(zip(ends, (way[0], way[-1]), strict=False)):
                 self._nodes.append(
-                    self._scene.add_label(f"{self._name}/end{k}", text, position=tuple(place), anchor="top-center")
+                    self._scene.add_label(f"/ghosts/end{k}", text, position=tuple(place), anchor="top-center")
                 )
 
     def hide(self) -> None:

@@ -251,7 +251,7 @@ def show_chart(chart: Chart, look: Look, server: Any) -> tuple[float, Callable[[
     """Each coordinate in turn, from its lowest to its highest value and back, with the task held; a `Scene`."""
     robot, home = chart.problem.robot, chart.problem.domain.home
     fans = [fan_along(chart, home, k) for k in range(chart.r)]
-    arm, ghosts = Arm(server.scene, "/arm", robot, look), Ghosts(server.scene, "/ghosts", robot)
+    arm, ghosts = Arm(server.scene, "/arm", robot, look), Ghosts(server.scene, robot)
     place_scene(server, robot, np.concatenate([fan.spread(5) for fan in fans]))
     # The label stands above the highest joint.
     above = robot.joint_points(home).max(axis=0) @ compute_up(robot) + 0.12 * compute_chain_length(robot.tree)

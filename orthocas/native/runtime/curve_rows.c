@@ -1,6 +1,6 @@
 /* The nearest xi along self-motion curves, one row after the other: the search of orthocas/charts/curves.py, which says
- * what is done and why, on the curves of native/runtime/self_motion.c. curves.c includes both behind the kernels, tables
- * and rules of a chart. */
+ * what is done and why, on the curves of native/runtime/self_motion.c. chart_search.c includes both behind the kernels,
+ * tables and rules of a chart. */
 #define SHEETS 256
 #define ENDS 64
 

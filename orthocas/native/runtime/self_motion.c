@@ -239,6 +239,17 @@ static int follow(node *nodes, int most, const double *target, double sense, int
   return count;
 }
 
+/* The nodes of a curve in the opposite order; tangents keep their sense. */
+static void turn_around(node *nodes, int count) {
+  int p;
+  for (p = 0; p < count / 2; ++p) {
+    const node swapped = nodes[p];
+    nodes[p] = nodes[count - 1 - p];
+    nodes[count - 1 - p] = swapped;
+  }
+  for (p = 0; p + 1 < count; ++p) nodes[p].length = nodes[p + 1].length;
+}
+
 /* The curve through q from end to end; the number of its nodes. */
 static int trace(node *nodes, int most, const double *q, const double *t, const double *target, int *closed) {
   int count, behind, p, i;
@@ -247,21 +258,11 @@ static int trace(node *nodes, int most, const double *q, const double *t, const 
   count = follow(nodes, most, target, 1.0, closed);
   if (*closed || count == most) return count;
   /* It has two ends: the part behind comes first. */
-  for (p = 0; p < count / 2; ++p) {
-    const node swapped = nodes[p];
-    nodes[p] = nodes[count - 1 - p];
-    nodes[count - 1 - p] = swapped;
-  }
-  for (p = 0; p + 1 < count; ++p) nodes[p].length = nodes[p + 1].length;
+  turn_around(nodes, count);
   memcpy(nodes[count - 1].t, t, sizeof nodes[0].t);
   behind = follow(nodes + count - 1, most - count + 1, target, -1.0, closed);
   count += behind - 1;
-  for (p = 0; p < count / 2; ++p) {
-    const node swapped = nodes[p];
-    nodes[p] = nodes[count - 1 - p];
-    nodes[count - 1 - p] = swapped;
-  }
-  for (p = 0; p + 1 < count; ++p) nodes[p].length = nodes[p + 1].length;
+  turn_around(nodes, count);
   nodes[count - 1].length = 0.0;
   for (p = 0; p < behind; ++p)
     for (i = 0; i < N; ++i) nodes[p].t[i] = -nodes[p].t[i];
