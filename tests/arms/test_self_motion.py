@@ -3,6 +3,7 @@
 import importlib.util
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -15,7 +16,7 @@ from random_arms import random_arm
 import orthocas as oc
 from orthocas.arms.kernel import Curve, evaluate_cubic
 from orthocas.arms.self_motion import SelfMotions, find_motions
-from orthocas.errors import CompileError, InvalidValueError, UnknownNameError
+from orthocas.errors import CompileError, InvalidValueError, SingularTaskError, UnknownNameError
 from orthocas.tasks.domains import StopKind
 from orthocas.tools.checks import Array
 
@@ -87,6 +88,23 @@ def test_postures_of_newtons_method_are_on_the_arcs_of_other_tasks() -> None:
     require_all_found(oc.Arm(oc.Task.position_and_axis(random_arm(rng, 6, 0.0))), 1, 1, 60)
     require_all_found(oc.Arm(oc.Task.pose(random_arm(rng, 7, 0.2), axis="z")), 2, 1, 60)
     require_all_found(oc.Arm(oc.Task.orientation(random_arm(rng, 4, 0.0))), 3, 1, 60)
+
+
+def test_small_arms_with_a_slide_have_arcs_although_no_position_counts_as_clear() -> None:
+    """An arm of 5 cm: a slide of 1 cm moves its tip as far as a fifth of a radian does."""
+    robots = []
+    for seed in (7, 6):
+        tree = random_arm(np.random.default_rng(seed), 4, 0.3).tree
+        lengths = {"translations": 0.05 * tree.translations, "tip_translation": 0.05 * tree.tip_translation}
+        reach = np.where(tree.prismatic, 0.01, 2.0)
+        robots.append(oc.Robot(replace(tree, **lengths, lower=-reach, upper=reach)))
+        assert any(tree.prismatic)
+        with pytest.raises(SingularTaskError):
+            oc.branches(robots[-1], oc.Task.position(robots[-1]))
+    require_all_found(oc.Arm(oc.Task.position(robots[0])), 0, 3, 200)
+    # The joints of the other one move its tip on a surface only.
+    with pytest.raises(SingularTaskError, match="at all postures"):
+        oc.Arm(oc.Task.position(robots[1])).self_motion([0.0, 0.0, 0.0])
 
 
 def test_pinocchio_finds_the_pose_at_all_postures() -> None:
