@@ -159,6 +159,23 @@ def test_planar_arm_without_limits_has_one_closed_arc() -> None:
     assert there.value < 1e-9
 
 
+@pytest.mark.parametrize("bend", [1e-2, 3e-4, 1e-4, 3e-5])
+def test_a_nearly_stretched_arm_has_one_short_closed_arc(bend: float) -> None:
+    """With three links of length 1, |x|^2 = 9 - 2 (q2^2 + q2 q3 + q3^2) for small bends: an ellipse, if both are b.
+
+    The direction of x holds 3 q1 + 2 q2 + q3.
+    """
+    arm = planar()
+    (arc,) = arm.self_motion(arm.x([0.3, bend, bend]))
+    assert arc.closed
+    # The ellipse is 3 (q2 + q3)^2 + (q2 - q3)^2 = 12 b^2.
+    angle = np.linspace(0, 2 * np.pi, 2001)
+    total, difference = 2 * bend * np.cos(angle), 2 * np.sqrt(3) * bend * np.sin(angle)
+    q2, q3 = (total + difference) / 2, (total - difference) / 2
+    way = np.column_stack([-(2 * q2 + q3) / 3, q2, q3])
+    assert arc.length == pytest.approx(np.linalg.norm(np.diff(way, axis=0), axis=1).sum(), rel=2e-3)
+
+
 def test_points_on_an_arc_are_as_far_apart_as_their_places() -> None:
     arc = panda().self_motion(panda().x(postures(panda(), 1, 4)[0])).components[0]
     q = arc.at(np.linspace(0.0, arc.length, 20_001))
