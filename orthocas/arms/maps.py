@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,9 +12,9 @@ from numpy.typing import NDArray
 
 from orthocas.arms.kernel import Curve, CurveKernel, StoredPostures, build_equations
 from orthocas.charts.walls import Stop
-from orthocas.errors import InvalidValueError
+from orthocas.errors import InvalidValueError, SingularTaskError
 from orthocas.robots.robot import Robot
-from orthocas.tasks.branches import branches
+from orthocas.tasks.branches import Branch, branches
 from orthocas.tasks.domains import Box, StopKind
 from orthocas.tasks.regular_box import find_joint_range
 from orthocas.tasks.samples import sample_evenly
@@ -100,8 +101,12 @@ class ArmMaps:
         """Random postures from which searches start."""
         # Others may wait for this value, so no other threads take part.
         with use_threads(1):
-            robot, parts = self.robot, branches(self.robot, self.task)
-            whole, rng = find_joint_range(robot, 0), np.random.default_rng(RULES.seed)
+            robot, whole, rng = self.robot, find_joint_range(self.robot, 0), np.random.default_rng(RULES.seed)
+            # Small arms with slides are nowhere clear in units of [rad] and [m], and have curves all the same.
+            try:
+                parts: Sequence[Branch] = branches(robot, self.task)
+            except SingularTaskError:
+                parts = ()
             low, high = whole.centre - whole.half_width, whole.centre + whole.half_width
             q = rng.uniform(low, high, (RULES.stored, robot.n))
             # In the order of branches; postures of none come last.
@@ -113,6 +118,8 @@ class ArmMaps:
             # Next to singular positions, x moves less for the same way of joints: distances there count more.
             J = self.evaluate(q, np.tile(self._some_target, (len(q), 1)))[1]
             volume = np.linalg.det(J @ J.transpose(0, 2, 1))
+            if not parts and np.linalg.matrix_rank(J).max() < self.task.m:
+                raise SingularTaskError("the task is singular at all postures, expected one that the joints can move")
             weights = np.maximum(volume, RULES.least_volume) ** (-1 / self.task.m)
             places = np.ascontiguousarray((self.targets_of(q) / self.place_sizes).T, dtype=np.float32)
         begins = np.flatnonzero(np.diff(own, prepend=-1, append=len(parts) + 1))

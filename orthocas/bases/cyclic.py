@@ -243,11 +243,18 @@ def resolved(cyclic: Cyclic, problem: Problem) -> tuple[str, ...]:
 
 
 def anywhere(problem: Problem, base: tuple[str, ...]) -> Problem:
-    """The problem on a domain without ends in those joints of the base that have no limits."""
+    """The problem on a domain without ends in joints of the base that have no limits, with samples of whole turns.
+
+    The first two coordinates of a `Mobile` chart change places as the base turns, and their angles with them.
+    """
     robot, domain = problem.robot, problem.domain
     places = [robot.joint_names.index(name) for name in base]
     free = {k for k in places if np.isinf(robot.lower[k]) and np.isinf(robot.upper[k])}
-    if free <= {*domain.unbounded}:
+    half_width = domain.half_width.copy()
+    for k in free:
+        low, high = _find_range(problem, k)
+        half_width[k] = (high - low) / 2
+    if free <= {*domain.unbounded} and (half_width == domain.half_width).all():
         return problem
-    wider = domain.apply_to(Box(domain.centre, domain.half_width, sorted(free | {*domain.unbounded})))
+    wider = domain.apply_to(Box(domain.centre, half_width, sorted(free | {*domain.unbounded})))
     return Problem(robot, problem.task, problem.metric, wider, problem.name)

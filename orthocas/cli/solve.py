@@ -68,8 +68,10 @@ def solve(
             found = chart.nearest_xi(q_start, target)
         else:
             found = chart.solve(x=target, xi=parse_numbers("--xi", xi, chart.r), q_start=near)
-        name = str(chart.notes.get("branch", ""))
-        rows = [(found.q[0], np.ravel(chart.xi(found.q[0])), found.status[0], name)]
+        # Rows of bad input have no posture.
+        q, name = found.q[0], str(chart.notes.get("branch", ""))
+        values = np.ravel(chart.xi(q)) if np.isfinite(q).all() else np.full(chart.r, np.nan)
+        rows = [(q, values, found.status[0], name)]
     _print(rows, json)
 
 

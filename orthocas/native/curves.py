@@ -14,7 +14,7 @@ class CurveRules:
     patience: int = 96  #: starts in turn that find no new curve, after which the search ends
     reach: int = 25  #: steps from a start to x
     reached: float = 1e-5  #: error that one more step reduces to its square
-    arrived: float = 1e-4  #: length of the last step, after which another one is rounding, also near singular positions
+    arrived: float = 1e-6  #: length of the last step, after which another one is rounding, also on curves of 1e-4 rad
     far_damping: float = 1e-3  #: of steps with an error above 0.1, relative to the trace of J J^T
     near_damping: float = 1e-5  #: of steps with an error above 1e-3
     largest: float = 0.7  #: norm of a step to x

@@ -693,7 +693,7 @@ class Task(Shown, HoldsFunctions):
         Args:
             pose: a pose or many of them: matrices (4, 4) or (N, 4, 4); an object with `translation` and `rotation`,
                 such as `pinocchio.SE3`, or a list of such; a pair of position and orientation as in `value`. Or task
-                values (m,) or (N, m), which come back as they are.
+                values (m,) or (N, m), which come back as they are; a rotation matrix is not taken for three of them.
 
         Raises:
             InvalidValueError, ShapeError: if the pose has no meaning for the task, or is none.
@@ -722,6 +722,9 @@ class Task(Shown, HoldsFunctions):
             if np.abs(values[..., 3, :] - [0.0, 0.0, 0.0, 1.0]).max(initial=0.0) > 1e-9:
                 raise InvalidValueError("target", values[..., 3, :].tolist(), "matrices with the last row (0, 0, 0, 1)")
             return self._value_of(values[..., :3, 3], values[..., :3, :3])
+        # Three rotation vectors are hardly ever a rotation matrix; whoever gives one means the orientation.
+        if values.shape == (3, 3) and self.turn is not None and np.abs(values @ values.T - np.eye(3)).max() < 1e-6:
+            raise InvalidValueError("target", values.tolist(), "task.value(None, R) of a rotation matrix R, or a pose")
         return values
 
     def _value_of(self, position: Array, orientation: Array) -> Array:

@@ -3,6 +3,7 @@
 import importlib.util
 import shutil
 from collections.abc import Callable
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
@@ -15,7 +16,7 @@ from random_arms import random_arm
 import orthocas as oc
 from orthocas.arms.kernel import Curve, evaluate_cubic
 from orthocas.arms.self_motion import SelfMotions, find_motions
-from orthocas.errors import CompileError, InvalidValueError, UnknownNameError
+from orthocas.errors import CompileError, InvalidValueError, SingularTaskError, UnknownNameError
 from orthocas.tasks.domains import StopKind
 from orthocas.tools.checks import Array
 
@@ -89,6 +90,23 @@ def test_postures_of_newtons_method_are_on_the_arcs_of_other_tasks() -> None:
     require_all_found(oc.Arm(oc.Task.orientation(random_arm(rng, 4, 0.0))), 3, 1, 60)
 
 
+def test_small_arms_with_a_slide_have_arcs_although_no_position_counts_as_clear() -> None:
+    """An arm of 5 cm: a slide of 1 cm moves its tip as far as a fifth of a radian does."""
+    robots = []
+    for seed in (7, 6):
+        tree = random_arm(np.random.default_rng(seed), 4, 0.3).tree
+        lengths = {"translations": 0.05 * tree.translations, "tip_translation": 0.05 * tree.tip_translation}
+        reach = np.where(tree.prismatic, 0.01, 2.0)
+        robots.append(oc.Robot(replace(tree, **lengths, lower=-reach, upper=reach)))
+        assert any(tree.prismatic)
+        with pytest.raises(SingularTaskError):
+            oc.branches(robots[-1], oc.Task.position(robots[-1]))
+    require_all_found(oc.Arm(oc.Task.position(robots[0])), 0, 3, 200)
+    # The joints of the other one move its tip on a surface only.
+    with pytest.raises(SingularTaskError, match="at all postures"):
+        oc.Arm(oc.Task.position(robots[1])).self_motion([0.0, 0.0, 0.0])
+
+
 def test_pinocchio_finds_the_pose_at_all_postures() -> None:
     model, tip = read_arm("panda")
     data, frame = model.createData(), model.getFrameId(tip)
@@ -139,6 +157,23 @@ def test_planar_arm_without_limits_has_one_closed_arc() -> None:
     assert np.abs(turned - np.round(turned)).max() < 1e-9
     there = motions.nearest(q + np.array([0.0, 0.0, 2 * np.pi]))  # a turn of an endless joint does not count
     assert there.value < 1e-9
+
+
+@pytest.mark.parametrize("bend", [1e-2, 3e-4, 1e-4, 3e-5])
+def test_a_nearly_stretched_arm_has_one_short_closed_arc(bend: float) -> None:
+    """With three links of length 1, |x|^2 = 9 - 2 (q2^2 + q2 q3 + q3^2) for small bends: an ellipse, if both are b.
+
+    The direction of x holds 3 q1 + 2 q2 + q3.
+    """
+    arm = planar()
+    (arc,) = arm.self_motion(arm.x([0.3, bend, bend]))
+    assert arc.closed
+    # The ellipse is 3 (q2 + q3)^2 + (q2 - q3)^2 = 12 b^2.
+    angle = np.linspace(0, 2 * np.pi, 2001)
+    total, difference = 2 * bend * np.cos(angle), 2 * np.sqrt(3) * bend * np.sin(angle)
+    q2, q3 = (total + difference) / 2, (total - difference) / 2
+    way = np.column_stack([-(2 * q2 + q3) / 3, q2, q3])
+    assert arc.length == pytest.approx(np.linalg.norm(np.diff(way, axis=0), axis=1).sum(), rel=2e-3)
 
 
 def test_points_on_an_arc_are_as_far_apart_as_their_places() -> None:

@@ -115,6 +115,11 @@ def test_poses_are_checked() -> None:
             task.value(*arguments)
     with pytest.raises(InvalidValueError, match="expected None"):
         oc.Task.orientation(arm()).value([0, 0, 0], np.eye(3))
+    # Three rotation vectors, and a matrix that would be taken for such.
+    task = oc.Task.orientation(arm())
+    np.testing.assert_array_equal(task.target(np.diag([0.1, 0.2, 0.3])), np.diag([0.1, 0.2, 0.3]))
+    with pytest.raises(InvalidValueError, match=r"task.value\(None, R\)"):
+        task.target(Rotation.from_rotvec([0.3, 0.2, 0.1]).as_matrix())
     for other in (oc.Task.position(arm()), oc.Task.axis(arm())):
         with pytest.raises(InvalidValueError, match="a whole orientation"):
             other.value([0, 0, 0], np.eye(3))

@@ -96,6 +96,16 @@ def test_one_chart_holds_at_every_place_and_heading(robot: oc.Robot, chart: oc.C
 
 
 @pytest.mark.slow
+def test_a_report_is_one_of_all_headings(chart: oc.Chart) -> None:
+    """The leaks of the two coordinates that change places as the base turns, against headings of one's own."""
+    rng = np.random.default_rng(5)
+    q = HOME + 0.2 * rng.uniform(-1, 1, (4000, 10))
+    q[:, 2] = rng.uniform(-np.pi, np.pi, 4000)
+    wanted = oc.evaluate(chart, points=q).leak.rms_of_each
+    assert oc.evaluate(chart, samples=4000).leak.rms_of_each == pytest.approx(wanted, rel=0.05)
+
+
+@pytest.mark.slow
 def test_closed_paths_bring_the_base_back(chart: oc.Chart) -> None:
     tracker, start = chart.tracker(HOME), chart.phi(HOME)
     along, furthest = chart.jacobian(HOME)[6:, :2], 0.0

@@ -37,6 +37,11 @@ def test_charts_and_arms_are_solved(run: Run, arm_file: Path) -> None:
     assert (code, "NOT_FOUND" in text) == (1, True)
 
 
+def test_a_number_that_is_not_finite_has_a_status(run: Run) -> None:
+    code, text, _ = run("solve", "panda-position", "--x", "0.4,0.1,0.5", "--xi", "nan,0,0,0", "--json")
+    assert (code, json.loads(text)["postures"][0]["status"]) == (1, "BAD_INPUT")
+
+
 def test_codegen_writes_the_tracker_of_an_arm(run: Run, arm_file: Path, tmp_path: Path) -> None:
     made = json.loads(run("codegen", str(arm_file), "--controller", "track", "--out", str(tmp_path / "c"), "--json")[1])
     assert Path(made["source"]).name == "arm_track.c"
