@@ -767,25 +767,23 @@ static int gives_way(const orthocas_state *state) {
 }
 
 /* Whether joints are faster than their limits, or on the way there: they accelerate on, half as much on average, until
- * the torque that does it is taken back, which takes time by command_rate: what commands drive them with, as far as it
- * shows in M ddq. Walls balance some of it, and what a blow does is none of it. */
-static int hurries(const orthocas_arm *arm, orthocas_state *state, double period, double *work) {
+ * the torque that drives them is taken back, which takes time by command_rate. That is what commands have put in and
+ * nothing that is felt balances: an arm that presses against a wall, or rebounds from a blow, is not driven by that. */
+static int hurries(const orthocas_arm *arm, orthocas_state *state, double period) {
   const orthocas_safety *safety = state->safety;
-  const int n = arm->torque ? arm->n : 0;
   const double *dq = state->dq, rate = fmin(rules.trend, 1.0 / period);
-  double *ddq = take(&work, arm->n), *net = take(&work, arm->n), until = 0.0;
+  double until = 0.0;
   int hurry = faster_than(arm, dq, safety->speed_limit, 1.0);
-  for (int i = 0; i < n; ++i) {
-    ddq[i] = rate * (dq[i] - state->trend[i]);
-    state->trend[i] += period * ddq[i];
+  for (int i = 0; i < arm->n && arm->torque; ++i) {
+    const double driven = state->drive[i] - state->load[i], net = state->drive[i] + state->touch[i];
+    const double left = driven * net > 0.0 ? fmin(fabs(driven), fabs(net)) : 0.0;
+    until = fmax(until, left / fmax(safety->command_rate[i], arm->numbers.smallest));
   }
-  multiply(state->inertia, ddq, net, n);
-  for (int i = 0; i < n; ++i) {
-    const double driven = state->drive[i] - state->load[i], most = driven * net[i] > 0.0 ? fabs(net[i]) : 0.0;
-    until = fmax(until, fmin(fabs(driven), most) / fmax(safety->command_rate[i], arm->numbers.smallest));
+  for (int i = 0; i < arm->n && arm->torque; ++i) {
+    const double gained = dq[i] - state->trend[i], soon = 0.5 * rate * gained * until; /* as they gain */
+    if (state->mode == ORTHOCAS_LAW && gained * dq[i] > 0.0 && fabs(dq[i] + soon) > safety->speed_limit[i]) hurry = 1;
+    state->trend[i] += rate * period * gained;
   }
-  for (int i = 0; i < n && state->mode == ORTHOCAS_LAW; ++i)
-    if (ddq[i] * dq[i] > 0.0 && fabs(dq[i] + 0.5 * until * ddq[i]) > safety->speed_limit[i]) hurry = 1;
   return hurry;
 }
 
@@ -814,7 +812,7 @@ static int touches(const orthocas_arm *arm, const orthocas_state *state) {
 static void choose_mode(const orthocas_arm *arm, orthocas_state *state, int law, double clear, double room,
                         const double *error, double period, int late, double *work) {
   const orthocas_safety *safety = state->safety;
-  const int hurry = hurries(arm, state, period, work), fast = hurry && state->hasty >= rules.hasty;
+  const int hurry = hurries(arm, state, period), fast = hurry && state->hasty >= rules.hasty;
   const int ready = works(law) && room >= safety->return_margin, touch = touches(arm, state);
   double *speed = take(&work, arm->n);
   for (int i = 0; i < arm->n; ++i) speed[i] = clipped(state->dq[i], safety->speed_limit[i]);
