@@ -683,6 +683,42 @@ static void test_modes(void) {
   dq[0] = -6.1;
   CHECK(steps(6) == ORTHOCAS_CAUGHT);
   CHECK(state.cause == ORTHOCAS_TOO_FAST || state.cause == ORTHOCAS_OUTSIDE_DOMAIN);
+  /* A law that made joints fast gives way: at once what drives a joint on, all else together, whatever the law wants. */
+  start_law(arm);
+  set(settings[0], 1000, 1000, 1000);
+  fault.law = 20;
+  (void)steps(40);
+  set(dq, 6.1, -0.1, 0);
+  for (k = 0; k < 8 && state.mode == ORTHOCAS_LAW; ++k) (void)step(1e-3);
+  CHECK(state.mode == ORTHOCAS_CATCHER && state.cause == ORTHOCAS_TOO_FAST);
+  CHECK((fabs(state.law[0]) > 0.0) == !arm->torque && state.law[1] > 15.0 && state.law[2] > 15.0);
+  fault.law = -20;
+  for (k = 0; k < 5; ++k) {
+    const double had = state.law[1], before = state.weight;
+    double left = 0.0;
+    (void)step(1e-3);
+    for (int i = 0; i < N && arm->torque; ++i) left = fmax(left, fabs(state.drive[i] - state.load[i]));
+    CHECK(!(fabs(state.law[1] - had) > 0.0));
+    CHECK(fabs(before - state.weight - (arm->torque ? before / left : 1e-3 / 0.03)) < 1e-12);
+  }
+  /* Torques that drive a joint are foreseen until they are taken back; not those that a wall balances, as a blow comes. */
+  start_law(arm);
+  set(settings[0], 1000, 1000, 1000);
+  fault.law = 80;
+  for (k = 0; k < 200 && state.mode == ORTHOCAS_LAW; ++k) {
+    (void)step(1e-3);
+    dq[0] += 1e-3 * (command[0] - 0.1 * q[0]);
+  }
+  CHECK(state.mode == ORTHOCAS_CATCHER && state.cause == ORTHOCAS_TOO_FAST && (dq[0] < 5.6 || !arm->torque));
+  start_law(arm);
+  set(settings[0], 1000, 1000, 1000);
+  fault.law = 20;
+  (void)steps(40);
+  for (k = 0; k < 16; ++k) {
+    dq[0] -= 0.3;
+    (void)step(1e-3);
+  }
+  CHECK(state.mode == ORTHOCAS_LAW);
   start_law(arm);
   (void)steps(2);
   set(q, 0.14, 0.1, 0.1);

@@ -91,6 +91,12 @@ static double *take(double **work, int count) {
   return place;
 }
 
+static void swap(double *x, double *y) {
+  const double kept = *x;
+  *x = *y;
+  *y = kept;
+}
+
 /* Solve A x = b for `count` columns b, one after the other, by Gaussian elimination with pivoting. Overwrites A, and b
  * with x. Returns 0 if A is singular. */
 static int solve(const orthocas_arm *arm, double *A, double *b, int size, int count) {
@@ -101,16 +107,8 @@ static int solve(const orthocas_arm *arm, double *A, double *b, int size, int co
     for (int i = k + 1; i < size; ++i)
       if (fabs(A[i * size + k]) > fabs(A[pivot * size + k])) pivot = i;
     if (!(fabs(A[pivot * size + k]) > arm->numbers.pivot)) return 0;
-    for (int j = k; j < size && pivot > k; ++j) {
-      double swap = A[k * size + j];
-      A[k * size + j] = A[pivot * size + j];
-      A[pivot * size + j] = swap;
-    }
-    for (x = b; x < end; x += size) {
-      double swap = x[k];
-      x[k] = x[pivot];
-      x[pivot] = swap;
-    }
+    for (int j = k; j < size && pivot > k; ++j) swap(A + k * size + j, A + pivot * size + j);
+    for (x = b; x < end; x += size) swap(x + k, x + pivot);
     for (int i = k + 1; i < size; ++i) {
       double factor = A[i * size + k] / A[k * size + k];
       for (int j = k + 1; j < size; ++j) A[i * size + j] -= factor * A[k * size + j];
@@ -205,12 +203,11 @@ static double search(const orthocas_arm *arm, const double *wanted, double *q, i
   const int n = arm->n;
   double *next = take(&work, n), *step = take(&work, n), *residual = take(&work, n), *jacobian = take(&work, n * n);
   double error = residual_at(arm, wanted, q, residual, jacobian, work);
-  int halvings;
   while (error > arm->numbers.exact && *left > 0) {
     double reached = -1.0, share = 1.0;
     copy(step, residual, n);
     if (!solve(arm, jacobian, step, n, 1)) break;
-    for (halvings = error > arm->numbers.solved ? rules.halvings : 1; halvings > 0 && *left > 0;
+    for (int halvings = error > arm->numbers.solved ? rules.halvings : 1; halvings > 0 && *left > 0;
          --halvings, --*left, share *= 0.5) {
       for (int i = 0; i < n; ++i) next[i] = q[i] + share * step[i];
       reached = residual_at(arm, wanted, next, residual, jacobian, work);
@@ -566,6 +563,12 @@ static double way_from_path(const orthocas_boundary *path, const double *q, doub
   return sqrt(nearest);
 }
 
+static void rotate(double *x, double *y, double c, double s) {
+  const double left = *x, right = *y;
+  *x = c * left - s * right;
+  *y = s * left + c * right;
+}
+
 /* Smallest eigenvalue of a symmetric matrix (m, m), by Jacobi's rotations. Overwrites it. */
 static double smallest_eigenvalue(double *A, int m) {
   double least = INFINITY;
@@ -576,16 +579,8 @@ static double smallest_eigenvalue(double *A, int m) {
         const double length = fabs(half) + sqrt(half * half + a * a);
         const double t = length > 0.0 ? (half < 0.0 ? -a : a) / length : 0.0;
         const double c = 1.0 / sqrt(1.0 + t * t), s = t * c;
-        for (int k = 0; k < m; ++k) {
-          const double left = A[k * m + i], right = A[k * m + j];
-          A[k * m + i] = c * left - s * right;
-          A[k * m + j] = s * left + c * right;
-        }
-        for (int k = 0; k < m; ++k) {
-          const double left = A[i * m + k], right = A[j * m + k];
-          A[i * m + k] = c * left - s * right;
-          A[j * m + k] = s * left + c * right;
-        }
+        for (int k = 0; k < m; ++k) rotate(A + k * m + i, A + k * m + j, c, s);
+        for (int k = 0; k < m; ++k) rotate(A + i * m + k, A + j * m + k, c, s);
       }
   for (int i = 0; i < m; ++i) least = fmin(least, A[i * m + i]);
   return least;
@@ -714,9 +709,7 @@ static int look(const orthocas_arm *arm, orthocas_state *state, const double *q,
     state->same_ticks = 0;
     set_zero(state->impulse, n);
     if (arm->torque) set_zero(state->momentum, n);
-  } else if (same) {
-    state->same_ticks = later(state->same_ticks, period);
-  }
+  } else if (same) state->same_ticks = later(state->same_ticks, period);
   return good && !frozen(arm, state, dq, work);
 }
 
@@ -757,11 +750,10 @@ static void release_arm(const orthocas_arm *arm, orthocas_state *state, const do
 /* R11: on the way back, the anchor moves in a straight line, no joint faster than return_speed, towards a place where
  * the law worked last. If it does not work there, it goes on to the centre. */
 static void move_anchor(const orthocas_arm *arm, orthocas_state *state, double period, double *work) {
-  const orthocas_safety *safety = state->safety;
   double *way = take(&work, arm->n), left = 0.0;
   for (int i = 0; i < arm->n; ++i) {
     way[i] = between(arm, i, state->safe[i] - state->anchor[i]);
-    left = fmax(left, fabs(way[i]) / fmin(safety->return_speed, rules.slow * safety->speed_limit[i]));
+    left = fmax(left, fabs(way[i]) / fmin(state->safety->return_speed, rules.slow * state->safety->speed_limit[i]));
   }
   for (int i = 0; i < arm->n; ++i) state->anchor[i] += left > period ? way[i] * (period / left) : way[i];
   if (!(left > period)) well_inside(arm, state->safe, 0.0, state->safe, work);
@@ -769,15 +761,24 @@ static void move_anchor(const orthocas_arm *arm, orthocas_state *state, double p
 
 static int works(int law) { return law == ORTHOCAS_OK || law == ORTHOCAS_SATURATED; }
 
+/* Whether the catcher took over from a law that made joints fast, or touches. */
+static int gives_way(const orthocas_state *state) {
+  return state->mode == ORTHOCAS_CATCHER && (state->cause == ORTHOCAS_TOO_FAST || state->cause == ORTHOCAS_TOUCHED);
+}
+
 /* Whether joints are faster than their limits, or on the way there: they accelerate on, half as much on average, until
- * the torque that drives them is taken back, which takes time by command_rate. */
+ * the torque that drives them is taken back, which takes time by command_rate. That is what commands have put in and
+ * nothing that is felt balances: an arm that presses against a wall, or rebounds from a blow, is not driven by that. */
 static int hurries(const orthocas_arm *arm, orthocas_state *state, double period) {
   const orthocas_safety *safety = state->safety;
   const double *dq = state->dq, rate = fmin(rules.trend, 1.0 / period);
   double until = 0.0;
   int hurry = faster_than(arm, dq, safety->speed_limit, 1.0);
-  for (int i = 0; i < arm->n && arm->torque; ++i)
-    until = fmax(until, fabs(state->drive[i] - state->load[i]) / fmax(safety->command_rate[i], arm->numbers.smallest));
+  for (int i = 0; i < arm->n && arm->torque; ++i) {
+    const double driven = state->drive[i] - state->load[i], net = state->drive[i] + state->touch[i];
+    const double left = driven * net > 0.0 ? fmin(fabs(driven), fabs(net)) : 0.0;
+    until = fmax(until, left / fmax(safety->command_rate[i], arm->numbers.smallest));
+  }
   for (int i = 0; i < arm->n && arm->torque; ++i) {
     const double gained = dq[i] - state->trend[i], soon = 0.5 * rate * gained * until; /* as they gain */
     if (state->mode == ORTHOCAS_LAW && gained * dq[i] > 0.0 && fabs(dq[i] + soon) > safety->speed_limit[i]) hurry = 1;
@@ -791,12 +792,11 @@ static int hurries(const orthocas_arm *arm, orthocas_state *state, double period
 static int stops_clear(const orthocas_arm *arm, const orthocas_state *state, double *work) {
   const double time = state->safety->fade_out + 1.0 / state->safety->damping;
   double *ahead = take(&work, arm->n);
-  int clear = 1;
-  for (int k = 1; k <= 2 && clear; ++k) {
+  for (int k = 1; k <= 2; ++k) {
     for (int i = 0; i < arm->n; ++i) ahead[i] = state->q[i] + 0.5 * (double)k * time * state->dq[i];
-    clear = contact_room(arm, ahead, work) > 0.0;
+    if (!(contact_room(arm, ahead, work) > 0.0)) return 0;
   }
-  return clear;
+  return 1;
 }
 
 /* R33: whether a joint feels more than contact_torque beside its load. R34: or commands gave the arm more energy than
@@ -981,7 +981,11 @@ static void advance(const orthocas_arm *arm, orthocas_state *state, const double
     state->weight = fmin(1.0, state->weight + period / safety->fade_in);
     state->brake = fmin(state->brake, 1.0 - state->weight);
   } else {
-    state->weight = fmax(0.0, state->weight - period / safety->fade_out);
+    double fall = period / safety->fade_out, left = 0.0;
+    for (int i = 0; i < arm->n && arm->torque && gives_way(state); ++i) /* until all is taken back: together */
+      left = fmax(left, fabs(state->drive[i] - state->load[i]) / fmax(safety->command_rate[i], arm->numbers.smallest));
+    if (left > 0.0) fall = state->weight * fmin(1.0, period / left);
+    state->weight = fmax(0.0, state->weight - fall);
   }
   for (int i = 0; i < arm->k && state->mode == ORTHOCAS_LAW && !cut; ++i) {
     const double e = clipped(error[i] + state->offset[i], safety->error_limit[i]);
@@ -1052,14 +1056,13 @@ static void compose_torque(const orthocas_arm *arm, orthocas_state *state, doubl
                            const double *fallback, double *command, double *M, double *bias, double *gravity,
                            double *work) {
   const orthocas_safety *safety = state->safety;
-  const double *q = state->q, *dq = state->dq;
   const double near = (safety->near_margin - room) / (safety->near_margin - safety->catch_margin);
   const double damping = safety->damping * fmax(1.0 - state->weight, fmin(fmax(near, 0.0), 1.0));
   double *spring = take(&work, arm->n), *wanted = take(&work, arm->n), *moved = take(&work, arm->n);
-  (void)orthocas_dynamics(arm, q, dq, M, bias, gravity);
+  (void)orthocas_dynamics(arm, state->q, state->dq, M, bias, gravity);
   learn_load(arm, state, M, period, fallback, work);
   brake_at(arm, state, M, spring, work);
-  for (int i = 0; i < arm->n; ++i) wanted[i] = stop_at(safety, i, q[i], dq[i]) - damping * dq[i];
+  for (int i = 0; i < arm->n; ++i) wanted[i] = stop_at(safety, i, state->q[i], state->dq[i]) - damping * state->dq[i];
   multiply(M, wanted, moved, arm->n);
   for (int i = 0; i < arm->n; ++i) {
     command[i] = fallback[i] + state->weight * state->law[i] + moved[i] - spring[i];
@@ -1070,13 +1073,12 @@ static void compose_torque(const orthocas_arm *arm, orthocas_state *state, doubl
 /* Velocity = weight times law + way to the anchor, no faster towards a joint limit than the distance allows (R19). */
 static void compose_velocity(const orthocas_arm *arm, orthocas_state *state, const double *fallback, double *command) {
   const orthocas_safety *safety = state->safety;
-  const double *q = state->q;
   const double reach = 2.0 * safety->return_speed / safety->damping;
   for (int i = 0; i < arm->n; ++i) {
-    const double way = clipped(between(arm, i, state->anchor[i] - q[i]), reach);
-    const double up = safety->stop_stiffness[i] * fmax(safety->upper[i] - q[i], 0.0);
-    const double down = safety->stop_stiffness[i] * fmax(q[i] - safety->lower[i], 0.0);
-    state->anchor[i] = q[i] + way;
+    const double way = clipped(between(arm, i, state->anchor[i] - state->q[i]), reach);
+    const double up = safety->stop_stiffness[i] * fmax(safety->upper[i] - state->q[i], 0.0);
+    const double down = safety->stop_stiffness[i] * fmax(state->q[i] - safety->lower[i], 0.0);
+    state->anchor[i] = state->q[i] + way;
     command[i] = fallback[i] + state->weight * state->law[i] + state->brake * safety->damping * way;
     command[i] = fmin(fmax(command[i], -down), up);
   }
@@ -1117,13 +1119,11 @@ static void observe(const orthocas_arm *arm, orthocas_state *state, double *q, d
   for (int i = 0; i < arm->n; ++i) {
     const double rate = state->safety->observer_rate[i], gap = between(arm, i, q[i] - state->q[i]);
     const double error = gap - clipped(gap, 0.5 * state->safety->encoder_step[i]);
-    double left, taken;
+    const double left = exp(-rate * period), taken = 1.0 - left;
     if (!observes(state) || !(rate > 0.0) || !(fabs(gap) <= rules.far_off)) {
       state->unexplained[i] = 0.0;
       continue;
     }
-    left = exp(-rate * period);
-    taken = 1.0 - left;
     q[i] -= gap - (1.0 - left * left * left) * error;
     dq[i] = state->dq[i] + 1.5 * taken * taken * (1.0 + left) / period * error;
     state->unexplained[i] += taken * taken * taken / (period * period) * error;
@@ -1294,7 +1294,7 @@ ORTHOCAS_API int orthocas_step(const orthocas_arm *arm, orthocas_state *state, i
                                const double *dq, const orthocas_reference *reference, const orthocas_gains *gains,
                                double period, double *command, double *work) {
   const orthocas_safety *safety = state->safety;
-  const int n = arm->n, k = arm->k, timed = period > 0.0 && period <= rules.longest;
+  const int n = arm->n, k = arm->k, before = state->mode, timed = period > 0.0 && period <= rules.longest;
   const int late = !(period <= safety->longest_period);
   const double since = timed ? fmin(period, safety->longest_period) : 0.0;
   double *shared = take(&work, arm->shared), *measured = take(&work, k), *change = take(&work, k);
@@ -1347,16 +1347,14 @@ ORTHOCAS_API int orthocas_step(const orthocas_arm *arm, orthocas_state *state, i
   fallback_at(arm, here, gains->used, fallback);
   /* Who commands, and the command. */
   choose_mode(arm, state, status, clear, room, error, since, late, work);
-  for (int i = 0; i < n; ++i) { /* one that made joints fast, or touches, gets no more than it had */
-    const double had = state->command[i] - fallback[i];
-    if (works(status)) state->law[i] = law[i] - fallback[i];
-    if (state->mode == ORTHOCAS_CATCHER && (state->cause == ORTHOCAS_TOO_FAST || state->cause == ORTHOCAS_TOUCHED))
-      state->law[i] = fmin(fmax(state->law[i], fmin(had, 0.0)), fmax(had, 0.0));
+  for (int i = 0; i < n; ++i) { /* one that gives way gets what it had, but nothing that drives its joint on */
+    if (gives_way(state) && before == ORTHOCAS_LAW) state->law[i] = state->command[i] - fallback[i];
+    else if (works(status) && !gives_way(state)) state->law[i] = law[i] - fallback[i];
+    if (gives_way(state) && arm->torque && state->law[i] * speed[i] > 0.0) state->law[i] = 0.0;
   }
   if (works(status) && state->mode == ORTHOCAS_LAW && room >= safety->return_margin + rules.room)
     copy(state->safe, here, n); /* the law works here */
-  if (arm->torque)
-    compose_torque(arm, state, room, gap, fallback, command, M, bias, gravity, work);
+  if (arm->torque) compose_torque(arm, state, room, gap, fallback, command, M, bias, gravity, work);
   else compose_velocity(arm, state, fallback, command);
   cut = cut_command(arm, state, since, command) || status == ORTHOCAS_SATURATED;
   copy(state->command, command, n);
