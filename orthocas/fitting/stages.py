@@ -164,7 +164,7 @@ class Continuation:
         if isinstance(target, GradedParametrisation):
             self._require_memory(target)
             steps = [target.of_degree(degree) for degree in range(min(target.degree, 2), target.degree + 1)]
-        last, before = steps[-1], 0.0
+        last, before = steps[-1], -np.inf
         try:
             for step in steps:
                 self._solve(step, step.label, final=step is last)
