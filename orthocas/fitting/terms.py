@@ -101,7 +101,7 @@ class UnitGradients:
 
     def pull_back(self, slopes: Array) -> Array:
         """dL/dJ_xi from dL/du_j, (N, r, n): dL/dv_j = (dL/du_j - (dL/du_j . u_j) g_j) / |v_j|."""
-        along = np.einsum("sji,sji->sj", slopes, self.rows)[:, :, None] * self.raised
+        along: Array = np.einsum("sji,sji->sj", slopes, self.rows)[:, :, None] * self.raised
         np.subtract(slopes, along, out=along)
         along /= self.lengths
         return along
