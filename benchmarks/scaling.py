@@ -25,7 +25,7 @@ from matplotlib.figure import Figure
 import orthocas as oc
 from orthocas import problems
 
-JOINTS = (6, 8, 10, 12, 16, 20, 25)
+JOINTS = (6, 8, 10, 12, 16, 20, 25, 30)
 EXPONENT_FROM = 12  # joints from which the exponent is fitted
 SEED, WIDTH = 0, 0.3
 HEADER = (

@@ -26,7 +26,7 @@ from orthocas.tools.json import collect_attributes
 class WorstRules:
     """Numbers of the quality at points, and of descents to the worst ones."""
 
-    chunk: int = 40_000  #: joint positions evaluated at once
+    chunk: int = 500_000  #: entries of (n, n) matrices at joint positions evaluated at once
     near_the_end: float = 0.1  #: cos(angle / 2) of turns beyond which rounding of J_x shows
     longest: float = 1e100  #: squares of longer gradients overflow: they have no value
     candidates: int = 6000  #: points from which descents may start
@@ -63,8 +63,9 @@ class Judged:
     @classmethod
     def at(cls, problem: Problem, coordinates: CoordinateMap, points: Array) -> Self:
         """Judge coordinates at joint positions (N, n)."""
-        starts = range(0, max(len(points), 1), WORST.chunk)
-        parts = [_judged(problem, coordinates, points[start : start + WORST.chunk]) for start in starts]
+        size = max(1, WORST.chunk // problem.n**2)
+        starts = range(0, max(len(points), 1), size)
+        parts = [_judged(problem, coordinates, points[start : start + size]) for start in starts]
         found: dict[str, Any] = parts[0]
         if len(parts) > 1:
             together = run_in_threads(lambda name: np.concatenate([part[name] for part in parts]), list(found))
@@ -510,9 +511,10 @@ def judge_by_lapack(samples: Samples, J: Array) -> dict[str, Array]:
     along = samples.task_basis @ covectors / own[:, None]
     m = along.shape[1]
     gram = np.block([[np.broadcast_to(np.eye(m), (len(along), m, m)), along], [along.transpose(0, 2, 1), in_metric]])
+    mutual = in_metric if samples.metric_inverse is None else _unit(gradients) @ unit.transpose(0, 2, 1)
     return {
         "task_cosines": samples.unit_task_gradients @ unit.transpose(0, 2, 1),
-        "mutual_cosines": np.einsum("spi,spi->sp", _unit(gradients)[:, first], unit[:, second]),
+        "mutual_cosines": mutual[:, first, second],
         "metric_mutual_cosines": in_metric[:, first, second],
         "leak_sines": np.linalg.norm(along, axis=1),
         "conditioning": np.asarray(np.sqrt(np.maximum(np.linalg.eigvalsh(gram)[:, 0], 0.0))),

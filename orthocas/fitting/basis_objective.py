@@ -19,6 +19,7 @@ from orthocas.bases.family import LinearFamily
 from orthocas.bases.products import ProductFamily
 from orthocas.fitting.sample_loss import (
     Loss,
+    LossByArrays,
     build_curvature_columns,
     build_loss_columns,
     build_residual_columns,
@@ -47,6 +48,7 @@ class ObjectiveRules:
 
     orienting: int = 200  #: samples that determine the orientation of a network's start
     piece: int = 2**18  #: entries of the largest array of a piece of samples; larger ones leave the cache
+    products: int = 2**22  #: products of pairs of numbers of a basis at once
     least_piece: int = 100  #: samples in a piece; smaller products waste time
     graph: int = 2**20  #: entries of the largest matrix in a graph; larger ones leave the cache
 
@@ -169,7 +171,7 @@ class BasisObjective:
         to factor. Its blocks, one for each coordinate, take n^5 and n^7.
         """
         # as few samples as leave enough residuals for each coefficient
-        residuals = self.N * (self._loss.hinge_rows.start or 1)
+        residuals = self.N * (self._loss.smooth_count or 1)
         rough = RULES.rough if self._loss.sizes.identity_metric else RULES.rough_in_metric
         stride = RULES.stride
         while 2 * stride <= RULES.most_stride and residuals >= 2 * stride * rough * theta.size:
@@ -286,6 +288,8 @@ class BasisObjective:
 
     def _build_blocks(self, theta: Array, stride: int) -> list[Array]:
         """The diagonal blocks of the same matrix, one for the coefficients of each coordinate."""
+        if self._loss.all_by_arrays:
+            return self._build_by_arrays(theta, stride)
         smooth, hinges = self._differentiate(theta, stride)
 
         def build(j: int) -> Array:
@@ -300,6 +304,23 @@ class BasisObjective:
             return H
 
         return [build(j) for j in range(self.r)]
+
+    def _build_by_arrays(self, theta: Array, stride: int) -> list[Array]:
+        """The same blocks from the squares D^T D of all residuals at every `stride`-th sample."""
+        if not self._loss.smooth_count:
+            # hinges alone have one residual a sample, so they need more of them
+            stride = 1
+            while stride * RULES.hinges < self.N:
+                stride *= 2
+        loss, X = build_loss_columns(self._loss), self.X[..., ::stride]
+        assert isinstance(loss, LossByArrays)
+        J = (self._table(theta) @ X).astype(np.float64, copy=False).reshape(len(X), self.n * self.r, -1)
+        data = [array[..., ::stride] for array in self._data]
+        blocks = [loss.build_curvatures(J[b], [array[b] for array in data]) for b in range(len(X))]
+        # without the padding of the last block
+        count = -(-self.N // stride)
+        squares = [np.concatenate(parts)[:count] for parts in zip(*blocks, strict=True)]
+        return [total / count for total in self._gradients.square(X, squares, self.kept)]
 
     def _differentiate(self, theta: Array, stride: int) -> tuple[list[Array], list[tuple[Any, Any, float]]]:
         """Derivatives of residuals with respect to J_xi, in single precision.
@@ -459,6 +480,23 @@ class BasisGradients(ABC):
         """All gradients at all samples, (N, n, K)."""
         return self.expand_part(X, samples, np.ones(self.family.width, dtype=bool))
 
+    def square(self, X: Array, squares: Sequence[Array], kept: NDArray[np.bool_]) -> list[Array]:
+        """Sums over samples of G^T W_j G for every coordinate j, with gradients G (n, K_j) of its functions.
+
+        Products are computed in single precision.
+
+        Args:
+            X: numbers at the samples, (B, g, S, c).
+            squares: symmetric W_j at the first of the samples, (N, n, n).
+            kept: the functions of every coordinate, (r, K).
+        """
+        found = []
+        for W, own in zip(squares, kept, strict=True):
+            G = self.expand_part(X, len(W), own, dtype=np.float32)
+            rows = W.astype(np.float32) @ G
+            found.append((G.reshape(-1, G.shape[2]).T @ rows.reshape(-1, G.shape[2])).astype(float))
+        return found
+
     def jacobian(self, X: Array, C: Array, samples: int) -> Array:
         """J_xi = T X of coefficients C (r, K) at all samples, (N, r, n)."""
         rows = np.matmul(self.build_table(C), X)  # (B, g, n r / g, c)
@@ -536,6 +574,27 @@ class ProductGradients(BasisGradients):
             self._parts[key] = self._upright[np.tile(kept, self.n)].astype(kind)
         dense = self._parts[key] @ values.astype(kind, copy=False)  # (n kept, samples)
         return np.ascontiguousarray(dense.T).reshape(dense.shape[1], self.n, int(kept.sum()))
+
+    def square(self, X: Array, squares: Sequence[Array], kept: NDArray[np.bool_]) -> list[Array]:
+        """Sums of W_j psi' psi'^T, which are far smaller, then D_i on both sides."""
+        n, S = self.n, X.shape[2]
+        values = X[:, 0].transpose(0, 2, 1).reshape(-1, S)[: len(squares[0])].astype(np.float32)
+        # both factors are symmetric: half of their entries
+        (i, j), (s, t) = np.triu_indices(n), np.triu_indices(S)
+        entries = np.concatenate([W[:, i, j].astype(np.float32).T for W in squares])
+        sums, piece = np.zeros((len(entries), len(s)), dtype=np.float32), max(1, RULES.products // len(s))
+        for start in range(0, len(values), piece):
+            part = slice(start, start + piece)
+            sums += entries[:, part] @ (values[part][:, s] * values[part][:, t])
+        found = []
+        for own, row in zip(np.split(sums, len(squares)), kept, strict=True):
+            half = np.empty((len(i), S, S), dtype=np.float32)
+            half[:, s, t] = half[:, t, s] = own
+            M = np.empty((n, S, n, S), dtype=np.float32)
+            M[i, :, j] = M[j, :, i] = half
+            D = self._lying[:, row]
+            found.append(np.asarray(D.T @ (D.T @ M.reshape(n * S, n * S)).T, dtype=float))
+        return found
 
     def differentiate_along(self, X: Array, directions: Array) -> Array:
         """The sum over the joints of D_i (a_i psi')."""

@@ -5,18 +5,19 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from functools import cache
-from typing import Any
+from functools import cache, partial
 
 import casadi as ca
 import numpy as np
 
 from orthocas.fitting.terms import (
     SAMPLE_DATA,
+    ArrayTerm,
     LossTerm,
     Pairs,
     RegularityTerm,
     Sizes,
+    UnitGradients,
     coordinates_of,
     find_term,
 )
@@ -24,8 +25,8 @@ from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array
 from orthocas.tools.columns import COLUMNS, ColumnFunction, Run
 
-# coordinates from which determinants of numbers are faster than written-out ones
-_BY_LAPACK = 8
+# coordinates from which arrays are faster than what is written out
+_BY_ARRAYS = 8
 
 
 @dataclass(frozen=True)
@@ -69,16 +70,31 @@ class Loss:
         return "null_basis" in self.data
 
     @cached_property
-    def volume_terms(self) -> tuple[tuple[float, RegularityTerm], ...]:
-        """Weights and terms whose determinants are too large to be written out."""
-        if self.sizes.r < _BY_LAPACK:
+    def array_terms(self) -> tuple[tuple[float, ArrayTerm], ...]:
+        """Weights and terms that arrays evaluate: none of few coordinates."""
+        if self.sizes.r < _BY_ARRAYS:
             return ()
-        return tuple((weight, term) for term, weight in self.terms if isinstance(term, RegularityTerm))
+        terms = ((weight, term) for term, weight in self.terms if isinstance(term, ArrayTerm))
+        return tuple((weight, term) for weight, term in terms if term.by_arrays(self.sizes))
+
+    @property
+    def all_by_arrays(self) -> bool:
+        """Whether arrays evaluate all terms, of coordinates that are not exchanged."""
+        return len(self.array_terms) == len(self.terms) and not self.exchanged
+
+    @cached_property
+    def volume_terms(self) -> tuple[tuple[float, RegularityTerm], ...]:
+        """Those among them whose determinants are too large to be written out."""
+        return tuple((weight, term) for weight, term in self.array_terms if isinstance(term, RegularityTerm))
 
     @cached_property
     def written_out(self) -> Loss:
         """The loss without its volume terms."""
-        names = {term.name for _, term in self.volume_terms}
+        return self.leave_out(self.volume_terms)
+
+    def leave_out(self, terms: Sequence[tuple[float, LossTerm]]) -> Loss:
+        """The loss without some terms."""
+        names = {term.name for _, term in terms}
         kept = tuple(pair for pair in self.weights if pair[0] not in names)
         return Loss(self.sizes, kept, self.exchanged) if names else self
 
@@ -118,10 +134,14 @@ class Loss:
         """Rows of the hinge terms of `written_out`, which are the last ones."""
         if self.volume_terms:
             return self.written_out.hinge_rows
+        return range(self.smooth_count, len(self._touched))
+
+    @cached_property
+    def smooth_count(self) -> int:
+        """Number of residuals without hinges."""
         J, data = self.arguments()
         named = dict(zip(self.data, data, strict=True))
-        counts = [term.residuals(J, named, self.sizes).shape[0] for term, _ in self.terms if not term.hinge]
-        return range(sum(counts), len(self._touched))
+        return sum(term.residuals(J, named, self.sizes).shape[0] for term, _ in self.terms if not term.hinge)
 
     @cached_property
     def _touched(self) -> list[list[int]]:
@@ -157,19 +177,19 @@ def build_loss_with_slopes(loss: Loss) -> ColumnFunction:
 
 
 @cache
-def build_loss_columns(loss: Loss) -> ColumnFunction | LossWithVolumes:
-    """Like `build_loss_with_slopes`, with volumes of many gradients by LAPACK."""
-    return LossWithVolumes(loss, build_loss_with_slopes) if loss.volume_terms else build_loss_with_slopes(loss)
+def build_loss_columns(loss: Loss) -> ColumnFunction | LossByArrays:
+    """Like `build_loss_with_slopes`; of many coordinates by arrays."""
+    return LossByArrays(loss, build_loss_with_slopes) if loss.array_terms else build_loss_with_slopes(loss)
 
 
 @cache
-def build_value_columns(loss: Loss) -> ColumnFunction | LossWithVolumes:
+def build_value_columns(loss: Loss) -> ColumnFunction | LossByArrays:
     """Loss of one sample, with the inputs of `build_sample_loss`."""
 
     def written(part: Loss) -> ColumnFunction:
         return ColumnFunction(build_sample_loss(part))
 
-    return LossWithVolumes(loss, written, slopes=False) if loss.volume_terms else written(loss)
+    return LossByArrays(loss, written, slopes=False) if loss.array_terms else written(loss)
 
 
 @cache
@@ -181,7 +201,7 @@ def build_residual_columns(loss: Loss) -> Callable[..., list[Array]]:
     residual (1, 1) and its derivative with respect to J_xi, (r, n).
     """
     if loss.volume_terms:
-        return LossWithVolumes(loss, build_residual_columns).residuals
+        return partial(_add_volumes, loss)
     J, data = loss.arguments()
     r, n = loss.sizes.r, loss.sizes.n
     rho = loss.residuals(J, data)
@@ -206,17 +226,65 @@ def build_curvature_columns(loss: Loss) -> ColumnFunction:
     return ColumnFunction(ca.Function("curvature", [J, *data], [second(ca.vec(J), *data)]))
 
 
-class LossWithVolumes:
-    """A loss on columns of samples, like a `ColumnFunction`, whose volume terms are computed by LAPACK.
+def _add_volumes(loss: Loss, J: Array, *data: Array) -> list[Array]:
+    """The outputs of `build_residual_columns` where LAPACK computes volumes."""
+    rest = loss.written_out
+    results = [np.empty((len(J), 0, COLUMNS)) for _ in range(loss.sizes.r)]
+    if rest.weights:
+        results = build_residual_columns(rest)(J, *(data[loss.data.index(name)] for name in rest.data))
+    blocks = [SampleBlock(loss, J[b], [array[b] for array in data]) for b in range(len(J))]
+    for weight, term in loss.volume_terms:
+        parts = [term.hinges(block.units, block.data) for block in blocks]
+        results.append(weight**0.5 * np.stack([rho[None] for rho, _ in parts]))
+        slopes = [block.pull_back(slopes) for block, (_, slopes) in zip(blocks, parts, strict=True)]
+        results.append(weight**0.5 * np.stack(slopes))
+    return results
+
+
+class SampleBlock:
+    """Unit gradients and data of a block of samples, one sample after the other.
 
     Args:
-        loss: with at least one volume term.
+        loss: the loss.
+        J: J_xi (n r, c), column by column.
+        data: data of the loss (entries, c), column by column.
+    """
+
+    def __init__(self, loss: Loss, J: Array, data: Sequence[Array]) -> None:
+        sizes = loss.sizes
+        self._pairs = loss.exchanged
+        #: data by name, (c, rows, columns)
+        self.data = {name: _split(array, SAMPLE_DATA[name](sizes)) for name, array in zip(loss.data, data, strict=True)}
+        rows = _turn(_split(J, (sizes.r, sizes.n)), self._pairs)
+        self.units = UnitGradients.of(rows, self.data.get("metric_inverse"))
+
+    def pull_back(self, slopes: Array) -> Array:
+        """dL/dJ_xi (n r, c), from the derivatives with respect to the unit gradients of coordinates, (c, r, n)."""
+        back = _turn(self.units.pull_back(slopes), tuple((j, i) for i, j in self._pairs))
+        return np.ascontiguousarray(back.transpose(2, 1, 0)).reshape(-1, len(back))
+
+
+def _split(entries: Array, shape: tuple[int, int]) -> Array:
+    """Matrices (c, rows, columns) from their entries (rows columns, c), column by column."""
+    return np.ascontiguousarray(entries.reshape(shape[1], shape[0], -1).transpose(2, 1, 0))
+
+
+def _turn(rows: Array, pairs: Pairs) -> Array:
+    """Coordinates of components, (c, r, n)."""
+    return np.stack(coordinates_of(list(rows.transpose(1, 0, 2)), pairs), axis=1) if pairs else rows
+
+
+class LossByArrays:
+    """A loss on columns of samples, like a `ColumnFunction`, with terms that arrays evaluate.
+
+    Args:
+        loss: with at least one such term.
         written: makes the function of the other terms.
         slopes: whether outputs are values and slopes, or only values.
     """
 
-    def __init__(self, loss: Loss, written: Callable[[Loss], Any], slopes: bool = True) -> None:
-        rest = loss.written_out
+    def __init__(self, loss: Loss, written: Callable[[Loss], ColumnFunction], slopes: bool = True) -> None:
+        rest = loss.leave_out(loss.array_terms)
         self._loss, self._slopes = loss, slopes
         self._written = written(rest) if rest.weights else None
         self._places = [loss.data.index(name) for name in rest.data]
@@ -239,17 +307,18 @@ class LossWithVolumes:
                 written = stack.enter_context(self._written.borrow(count))
             yield [self._run(own) for own in written]
 
-    def residuals(self, J: Array, *data: Array) -> list[Array]:
-        """The outputs of `build_residual_columns`."""
-        if self._written is None:
-            results = [np.empty((len(J), 0, COLUMNS)) for _ in range(self._loss.sizes.r)]
-        else:
-            results = self._written(J, *(data[k] for k in self._places))
-        for weight, term in self._loss.volume_terms:
-            parts = [self._of_block(term, J[b], [array[b] for array in data]) for b in range(len(J))]
-            results.append(weight**0.5 * np.stack([rho[None] for rho, _ in parts]))
-            results.append(weight**0.5 * np.stack([slopes for _, slopes in parts]))
-        return results
+    def build_curvatures(self, J: Array, data: Sequence[Array]) -> list[Array]:
+        """D_j^T D_j (c, n, n) of every coordinate j in single precision, for a block of samples with J_xi (n r, c).
+
+        D_j are the derivatives of all residuals with respect to row j of J_xi. All terms are arrays, and no coordinates
+        are exchanged.
+        """
+        block = SampleBlock(self._loss, J, data)
+        terms = [(weight, term.build_curvatures(block.units, block.data)) for weight, term in self._loss.array_terms]
+        return [
+            np.asarray(sum(weight * next(parts) for weight, parts in terms), dtype=np.float32)
+            for _ in range(self._loss.sizes.r)
+        ]
 
     def _run(self, written: Run | None) -> Run:
         def run(arguments: Sequence[Array], results: Sequence[Array]) -> None:
@@ -258,25 +327,15 @@ class LossWithVolumes:
                     result[...] = 0.0
             else:
                 written([arguments[0], *(arguments[1 + k] for k in self._places)], results)
-            # then the volume terms, whose determinants LAPACK computes
-            for weight, term in self._loss.volume_terms:
-                rho, slope = self._of_block(term, arguments[0], arguments[1:])
-                results[0][...] += (weight / 2 * rho**2).reshape(results[0].shape)
-                if self._slopes:
-                    results[1][...] += (weight * rho * slope.reshape(-1, len(rho))).reshape(results[1].shape)
+            # then the terms of arrays
+            block = SampleBlock(self._loss, arguments[0], arguments[1:])
+            slopes = np.zeros(block.units.rows.shape)
+            for weight, term in self._loss.array_terms:
+                values, own = term.differentiate(block.units, block.data)
+                results[0][...] += (weight * values).reshape(results[0].shape)
+                own *= weight
+                slopes += own
+            if self._slopes:
+                results[1][...] += block.pull_back(slopes).reshape(results[1].shape)
 
         return run
-
-    def _of_block(self, term: RegularityTerm, J: Array, data: Sequence[Array]) -> tuple[Array, Array]:
-        """Residuals (c,) of one block (n r, c), and their derivatives (n r, c)."""
-        sizes, pairs = self._loss.sizes, self._loss.exchanged
-        named = dict(zip(self._loss.data, data, strict=True))
-        # r times (c, n)
-        rows = list(J.reshape(sizes.n, sizes.r, -1).transpose(1, 2, 0))
-        Z = named["null_basis"].reshape(sizes.r, sizes.n, -1).transpose(2, 1, 0)
-        A = named.get("metric_inverse")
-        metric_inverse = None if A is None else A.reshape(sizes.n, sizes.n, -1).transpose(2, 1, 0)
-        turned = np.stack(coordinates_of(rows, pairs), axis=1)
-        rho, slopes = term.hinges(turned, Z, metric_inverse)
-        back = coordinates_of(list(slopes.transpose(1, 0, 2)), tuple((j, i) for i, j in pairs))
-        return rho, np.ascontiguousarray(np.stack(back).transpose(2, 0, 1)).reshape(J.shape)

@@ -122,8 +122,9 @@ class Continuation:
     """Solves a low degree from a spectral start, embeds the result, and solves the next degree.
 
     The worst points of each degree join the loss of the next one. The last degree is solved again until its least
-    conditioning is large enough or, without a fold, no longer grows. If folds remain after some rounds, or at once
-    where the domain holds singular positions, the domain forces them: then the last stage leaves the fold term out.
+    conditioning is large enough or, without a fold, no longer grows. Where the last round folds but an earlier one did
+    not, the best one is the result. If folds remain after some rounds, or at once where the domain holds singular
+    positions, the domain forces them: then the last stage leaves the fold term out.
 
     Args:
         problem: problem of the fit.
@@ -164,7 +165,9 @@ class Continuation:
         if isinstance(target, GradedParametrisation):
             self._require_memory(target)
             steps = [target.of_degree(degree) for degree in range(min(target.degree, 2), target.degree + 1)]
-        last, before = steps[-1], 0.0
+        last, before = steps[-1], -np.inf
+        # of the rounds without a fold the best one: its conditioning, number of stages up to it, and worst points
+        best: tuple[float, int, WorstPoints | None] = (0.0, 0, None)
         try:
             for step in steps:
                 self._solve(step, step.label, final=step is last)
@@ -174,8 +177,13 @@ class Continuation:
                 settled = 0 <= folds.least < before + RULES.least_gain
                 if unfolded or settled or (folds.least < 0 and folds.singular):
                     break
+                if folds.least >= best[0]:
+                    best = folds.least, len(self._stages), folds.worst
                 before = folds.least
                 self._solve(last, f"{last.label}, round {k}", final=True)
+            # new points may bring back folds that an earlier round had left behind
+            if folds.least < 0 and best[2] is not None:
+                self._stages, folds.worst = self._stages[: best[1]], best[2]
             # the domain forces folds: their term would only spoil the rest
             if folds.least < 0:
                 folds.give_up()

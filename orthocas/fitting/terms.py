@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, Protocol, runtime_checkable
+from typing import Any, ClassVar, Literal, Protocol, runtime_checkable
 
 import casadi as ca
 import numpy as np
@@ -83,6 +83,91 @@ class LossTerm(Protocol):
         ...
 
 
+@dataclass(frozen=True, eq=False)
+class UnitGradients:
+    """Unit gradients of r coordinates at N samples, in the metric."""
+
+    rows: Array  #: u_j = v_xi,j / |v_xi,j|_A^-1, (N, r, n)
+    raised: Array  #: g_j = u_j A^-1, (N, r, n)
+    lengths: Array  #: |v_xi,j|_A^-1, (N, r, 1)
+
+    @classmethod
+    def of(cls, J: Array, metric_inverse: Array | None) -> UnitGradients:
+        """Those of J_xi (N, r, n) with A^-1 (N, n, n); None for the identity."""
+        raised = J if metric_inverse is None else J @ metric_inverse
+        lengths = np.sqrt(np.einsum("sji,sji->sj", raised, J))[:, :, None]
+        rows = J / lengths
+        return cls(rows, rows if metric_inverse is None else raised / lengths, lengths)
+
+    def pull_back(self, slopes: Array) -> Array:
+        """dL/dJ_xi from dL/du_j, (N, r, n): dL/dv_j = (dL/du_j - (dL/du_j . u_j) g_j) / |v_j|."""
+        along: Array = np.einsum("sji,sji->sj", slopes, self.rows)[:, :, None] * self.raised
+        np.subtract(slopes, along, out=along)
+        along /= self.lengths
+        return along
+
+
+@runtime_checkable
+class ArrayTerm(LossTerm, Protocol):
+    """A term that arrays evaluate as well: of many coordinates they are faster than expressions, and built at once."""
+
+    def by_arrays(self, sizes: Sizes) -> bool:
+        """Whether arrays evaluate the term for a problem of these sizes."""
+        ...
+
+    def differentiate(self, units: UnitGradients, data: Mapping[str, Array]) -> tuple[Array, Array]:
+        """|rho|^2 / 2, (N,), and its derivatives with respect to the u_j, (N, r, n), with the data of N samples."""
+        ...
+
+    def build_curvatures(self, units: UnitGradients, data: Mapping[str, Array]) -> Iterator[Array]:
+        """D_j^T D_j (N, n, n) of every coordinate j, with the derivatives D_j of rho with respect to row j of J_xi."""
+        ...
+
+
+class CosineTerm:
+    """Arrays of a term whose residuals are scaled cosines c_aj = e_a . u_j with the unit gradients in the metric.
+
+    d c_aj / dv_j = (e_a - c_aj g_j) / |v_j|.
+    """
+
+    toward: ClassVar[str] = ""  #: the sample data that are the e_a (N, m, n); by default they are the g_k of others
+    in_metric: ClassVar[bool] = True  #: whether lengths are those of the metric, not Euclidean ones
+
+    def by_arrays(self, sizes: Sizes) -> bool:
+        """See `ArrayTerm`."""
+        return self.in_metric or sizes.identity_metric
+
+    def _list_directions(self, units: UnitGradients, data: Mapping[str, Array]) -> tuple[Array, float]:
+        """The e_a, (N, k, n), and the square of the scale: means over all pairs of task component and coordinate."""
+        if not self.toward:
+            return units.raised, 1 / len(pairs(units.rows.shape[1]))
+        return data[self.toward], 1 / (data[self.toward].shape[1] * units.rows.shape[1])
+
+    def differentiate(self, units: UnitGradients, data: Mapping[str, Array]) -> tuple[Array, Array]:
+        """See `ArrayTerm`."""
+        directions, scale = self._list_directions(units, data)
+        cosines = units.rows @ directions.transpose(0, 2, 1)  # (N, r, k)
+        if not self.toward:
+            # no gradient is a pair with itself
+            np.einsum("sjj->sj", cosines)[...] = 0.0
+        squares = np.einsum("sja,sja->s", cosines, cosines)
+        cosines *= scale
+        # each pair is there twice
+        return squares * (scale / (2 if self.toward else 4)), cosines @ directions
+
+    def build_curvatures(self, units: UnitGradients, data: Mapping[str, Array]) -> Iterator[Array]:
+        """See `ArrayTerm`."""
+        directions, scale = self._list_directions(units, data)
+        square = directions.transpose(0, 2, 1) @ directions
+        along = (units.rows @ directions.transpose(0, 2, 1)) @ directions  # sum_a c_aj e_a, (N, r, n)
+        for j in range(units.rows.shape[1]):
+            g, length = units.raised[:, j], units.lengths[:, j, :, None]
+            # sum_a (e_a - c g) (e_a - c g)^T = square - x g^T - g x^T with x = sum_a c e_a - g sum_a c^2 / 2
+            squares = np.einsum("si,si->s", along[:, j], units.rows[:, j])
+            mixed = (along[:, j] - squares[:, None] / 2 * g)[:, :, None] * g[:, None, :]
+            yield scale * (square - mixed - mixed.transpose(0, 2, 1)) / length**2
+
+
 Pairs = tuple[tuple[int, int], ...]  #: rows of J_xi
 
 
@@ -95,12 +180,14 @@ def coordinates_of(rows: Sequence[Any], exchanged: Pairs) -> list[Any]:
 
 
 @dataclass(frozen=True)
-class TaskTerm:
+class TaskTerm(CosineTerm):
     """Mean over task components i and coordinates j of the squared cosines of [AS2023] eq. (24), first sum.
 
     c_ij = v_x,i^T A^-1 v_xi,j / (|A^-1 v_x,i| |v_xi,j|), Euclidean norms; NaN where a coordinate gradient vanishes.
     """
 
+    toward: ClassVar[str] = "unit_task_gradients"
+    in_metric: ClassVar[bool] = False
     name: str = "task"
     data: tuple[str, ...] = ("unit_task_gradients",)
     hinge: bool = False
@@ -114,12 +201,13 @@ class TaskTerm:
 
 
 @dataclass(frozen=True)
-class MutualTerm:
+class MutualTerm(CosineTerm):
     """Mean over pairs of coordinates of the squared cosines of [AS2023] eq. (24), second sum. It is empty for r = 1.
 
     c_ij = v_xi,i^T A^-1 v_xi,j / (|A^-1 v_xi,i| |v_xi,j|), Euclidean norms, i > j.
     """
 
+    in_metric: ClassVar[bool] = False
     name: str = "mutual"
     data: tuple[str, ...] = ("metric_inverse",)
     hinge: bool = False
@@ -167,7 +255,7 @@ class MetricLengthTerm:
 
 
 @dataclass(frozen=True)
-class MetricTaskTerm:
+class MetricTaskTerm(CosineTerm):
     """Mean over a basis of the task gradients and over coordinates of the squared sines of leaks.
 
     With an A-orthonormal basis e_1..e_m of span{grad_A h_i}, s_aj = e_a . v_xi,j / |v_xi,j|_A^-1. The squares of column
@@ -177,6 +265,7 @@ class MetricTaskTerm:
         ours, docs/explanation/angles.md.
     """
 
+    toward: ClassVar[str] = "task_basis"
     name: str = "metric task"
     data: tuple[str, ...] = ("metric_inverse", "task_basis")
     hinge: bool = False
@@ -211,7 +300,7 @@ class SelfMotionTerm:
 
 
 @dataclass(frozen=True)
-class MetricMutualTerm:
+class MetricMutualTerm(CosineTerm):
     """Mean over pairs of coordinates of the squared cosines in the metric. It is empty for r = 1.
 
     c_ij = v_xi,i^T A^-1 v_xi,j / (|v_xi,i|_A^-1 |v_xi,j|_A^-1), i > j.
@@ -275,33 +364,31 @@ def gradient_volume(coordinate_jacobian: ca.SX, null_basis: ca.SX, metric_invers
     return compute_determinant((coordinate_jacobian @ null_basis) / ca.repmat(lengths, 1, coordinate_jacobian.shape[0]))
 
 
-def volume_hinges(J: Array, null_basis: Array, metric_inverse: Array | None, bound: float) -> tuple[Array, Array]:
-    """max(bound - det D, 0) of the `gradient_volume` det D, (N,), and its derivative with respect to J_xi, (N, r, n).
+def volume_hinges(units: UnitGradients, null_basis: Array, bound: float) -> tuple[Array, Array]:
+    """max(bound - det D, 0) of the `gradient_volume` det D, (N,), and its derivatives by the u_j, (N, r, n).
 
-    With the cofactors C of D, d(det D)/dv_j = sum_k C_jk z_k / |v_j| - det D A^-1 v_j / |v_j|^2.
+    With the cofactors C of D, d(det D)/du_j = sum_k C_jk z_k.
 
     Args:
-        J: J_xi, (N, r, n).
+        units: unit gradients u_j of the coordinates.
         null_basis: columns z_1..z_r, (N, n, r).
-        metric_inverse: A^-1, (N, n, n); None for the identity.
         bound: of the volume.
     """
-    raised = J if metric_inverse is None else J @ metric_inverse
-    lengths = np.sqrt((raised * J).sum(axis=2, keepdims=True))
-    # the volume of unit gradients across the task
-    D = J @ null_basis / lengths
+    D = units.rows @ null_basis
     volume = np.linalg.det(D)
-    hinges, slopes = np.maximum(bound - volume, 0.0), np.zeros(J.shape)
-    # its derivative by cofactors, where the hinge acts
+    hinges, cofactors = np.maximum(bound - volume, 0.0), np.zeros(D.shape)
+    # only where the hinge acts
     active = np.flatnonzero(hinges > 0)
-    across = _cofactors(D[active], volume[active]) @ null_basis[active].transpose(0, 2, 1) / lengths[active]
-    slopes[active] = volume[active, None, None] * raised[active] / lengths[active] ** 2 - across
-    return hinges, slopes
+    cofactors[active] = -_cofactors(D[active], volume[active])
+    return hinges, cofactors @ null_basis.transpose(0, 2, 1)
 
 
 def _cofactors(D: Array, volume: Array) -> Array:
     """Cofactors of matrices (N, r, r) with these determinants: det D D^-T, or by singular values next to folds."""
-    cofactors, folded = np.empty(D.shape), np.abs(volume) < RULES.nearly_folded
+    folded = np.abs(volume) < RULES.nearly_folded
+    if not folded.any():
+        return volume[:, None, None] * np.linalg.inv(D).transpose(0, 2, 1)
+    cofactors = np.empty(D.shape)
     cofactors[~folded] = volume[~folded, None, None] * np.linalg.inv(D[~folded]).transpose(0, 2, 1)
     U, s, Vt = np.linalg.svd(D[folded])
     sign = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
@@ -338,12 +425,31 @@ class RegularityTerm:
         hinge: ca.SX = ca.fmax(self.bound_for(sizes.r) - gradient_volume(coordinate_jacobian, Z, metric_inverse), 0)
         return hinge
 
-    def hinges(self, J: Array, null_basis: Array, metric_inverse: Array | None) -> tuple[Array, Array]:
-        """The residual (N,) and its derivative with respect to J_xi (N, r, n), by LAPACK; see `volume_hinges`."""
-        if self.euclidean and metric_inverse is not None:
-            null_basis, metric_inverse = null_basis.copy(), None
-            null_basis[:, :, 0] /= np.sqrt(np.linalg.det(null_basis.transpose(0, 2, 1) @ null_basis))[:, None]
-        return volume_hinges(J, null_basis, metric_inverse, self.bound_for(J.shape[1]))
+    def by_arrays(self, sizes: Sizes) -> bool:
+        """Determinants of more rows would be too large as expressions."""
+        return True
+
+    def hinges(self, units: UnitGradients, data: Mapping[str, Array]) -> tuple[Array, Array]:
+        """The residual (N,) and its derivatives with respect to the u_j, (N, r, n), by LAPACK; see `volume_hinges`."""
+        Z = data["null_basis"]
+        if self.euclidean and "metric_inverse" in data:
+            Z = Z.copy()
+            Z[:, :, 0] /= np.sqrt(np.linalg.det(Z.transpose(0, 2, 1) @ Z))[:, None]
+            units = UnitGradients.of(units.rows, None)
+            rho, slopes = volume_hinges(units, Z, self.bound_for(Z.shape[2]))
+            return rho, units.pull_back(slopes)
+        return volume_hinges(units, Z, self.bound_for(Z.shape[2]))
+
+    def differentiate(self, units: UnitGradients, data: Mapping[str, Array]) -> tuple[Array, Array]:
+        """See `ArrayTerm`."""
+        rho, slopes = self.hinges(units, data)
+        slopes *= rho[:, None, None]
+        return rho**2 / 2, slopes
+
+    def build_curvatures(self, units: UnitGradients, data: Mapping[str, Array]) -> Iterator[Array]:
+        """See `ArrayTerm`."""
+        slopes = units.pull_back(self.hinges(units, data)[1])
+        return (slopes[:, j, :, None] * slopes[:, j, None, :] for j in range(slopes.shape[1]))
 
 
 FOLD_TERM = RegularityTerm("folds", RULES.fold_volume)  #: for the worst points of the domain only

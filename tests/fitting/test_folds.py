@@ -7,8 +7,10 @@ import numpy as np
 import pytest
 
 import orthocas as oc
+from orthocas import problems
 from orthocas.bases import JointSpace
-from orthocas.charts.point_quality import Judged, least_in_domain, worst_points
+from orthocas.charts.point_quality import Judged, WorstPoints, least_in_domain, worst_points
+from orthocas.fitting import stages
 from orthocas.fitting.basis_objective import BasisObjective
 from orthocas.fitting.fit import Fit
 from orthocas.fitting.sample_loss import Loss, build_sample_loss
@@ -121,6 +123,31 @@ def test_no_rounds_on_a_domain_that_holds_singular_positions() -> None:
     assert fit.problem_check.singular_samples > 0
     assert [stage.label for stage in fit.stages] == ["polynomial:2", "polynomial:3", "polynomial:3, with folds"]
     assert fit.clear_part is not None
+
+
+@pytest.mark.parametrize(
+    ("found", "rounds", "least"),
+    [
+        ((-0.3, 0.1, 0.15, -0.2, -0.1), 3, 0.15),  # the best one without a fold, not the last
+        ((-0.3, -0.2, 0.1, 0.105), 4, 0.105),  # settled
+        ((0.005, 0.1, 0.3), 3, 0.3),  # a first round is not settled
+    ],
+)
+def test_rounds_that_fold_again_are_left_out(
+    monkeypatch: pytest.MonkeyPatch, found: tuple[float, ...], rounds: int, least: float
+) -> None:
+    """With searches that find these values."""
+    values = iter(found)
+
+    def search(problem: oc.Problem, *_: object) -> WorstPoints:
+        return WorstPoints(problem.domain.centre[None], np.array([next(values)]))
+
+    monkeypatch.setattr(stages, "worst_points", search)
+    fit = oc.fit(problems.get("planar_3r_xy"), oc.Polynomial(2), samples=300)
+    assert fit.worst is not None
+    assert fit.worst.least == least
+    assert len(fit.stages) == rounds
+    assert not list(values)
 
 
 @pytest.mark.slow

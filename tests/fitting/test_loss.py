@@ -11,7 +11,14 @@ from orthocas.bases import JointSpace
 from orthocas.cli.options import parse_weights
 from orthocas.errors import InvalidValueError
 from orthocas.fitting import network_objective
-from orthocas.fitting.basis_objective import BasisObjective, ObjectiveRules, build_gradients
+from orthocas.fitting.basis_objective import (
+    BasisGradients,
+    BasisObjective,
+    ObjectiveRules,
+    ProductGradients,
+    SparseGradients,
+    build_gradients,
+)
 from orthocas.fitting.network_objective import ArrayObjective, GraphObjective
 from orthocas.fitting.sample_loss import (
     Loss,
@@ -22,7 +29,18 @@ from orthocas.fitting.sample_loss import (
     build_value_columns,
 )
 from orthocas.fitting.starts import find_spectral_start
-from orthocas.fitting.terms import RULES, MutualTerm, Sizes, TaskTerm, Weights, gradient_volume, pairs, volume_hinges
+from orthocas.fitting.terms import (
+    RULES,
+    MutualTerm,
+    Sizes,
+    TaskTerm,
+    UnitGradients,
+    Weights,
+    gradient_volume,
+    pairs,
+    volume_hinges,
+)
+from orthocas.tasks.metric import MetricSpec
 from orthocas.tasks.samples import Draw, Samples, evaluate_samples, sample_problem
 from orthocas.tools import columns
 from orthocas.tools.expressions import compute_determinant
@@ -320,9 +338,9 @@ def test_determinants_and_their_gradients_are_those_of_numpy(rows: int) -> None:
     assert function.n_instructions() < 100 + 60 * rows * 2 ** (rows - 1)  # CasADi's own: 10^7 for 10 rows
 
 
-def many_joints(n: int) -> oc.Problem:
+def many_joints(n: int, metric: MetricSpec = "euclidean") -> oc.Problem:
     robot = oc.Robot.planar([1.0] * n, [1.0] * n)
-    return oc.Problem(robot, oc.Task.position(robot, "xy"), domain=oc.Box([0.1, *[0.4] * (n - 1)], 0.2))
+    return oc.Problem(robot, oc.Task.position(robot, "xy"), metric, oc.Box([0.1, *[0.4] * (n - 1)], 0.2))
 
 
 @pytest.mark.slow
@@ -332,6 +350,26 @@ def test_eleven_joints_are_fitted() -> None:
     assert fit.chart.r == 9
     assert fit.worst is not None
     assert fit.worst.least > 0.1
+
+
+@pytest.mark.parametrize("form", [ProductGradients, SparseGradients])
+@pytest.mark.parametrize("metric", ["euclidean", "inertia"])
+def test_blocks_by_arrays_are_those_of_the_whole_matrix(form: type[BasisGradients], metric: MetricSpec) -> None:
+    """Squares of residuals by arrays, and small sums of them, against expressions of all residuals.
+
+    Matrices are computed in single precision.
+    """
+    problem = many_joints(10, metric)
+    family = oc.Polynomial(2).family(JointSpace.of(problem), problem.r)
+    samples, weights = sample_problem(problem, 200, 0), oc.Weights().for_problem(problem)
+    theta = np.random.default_rng(1).normal(size=family.size)
+    gradients = form(family, problem.n)
+    objective = BasisObjective(family, samples, weights, theta, draw_from(problem), gradients=gradients)
+    whole, blocks = objective._build_matrix(theta, 1), objective._build_by_arrays(theta, 1)
+    assert len(blocks) == problem.r
+    for j, block in enumerate(blocks):
+        place = slice(j * family.width, (j + 1) * family.width)
+        np.testing.assert_allclose(block, whole[place, place], rtol=0, atol=1e-5 * np.abs(whole[place, place]).max())
 
 
 @pytest.mark.slow
@@ -361,7 +399,9 @@ def test_volumes_by_lapack_are_those_of_the_expression(identity: bool) -> None:
     J[2, 1] = J[2, 0] + 1e-6  # next to a fold
     root = rng.normal(size=(N, n, n))
     A = None if identity else root @ root.transpose(0, 2, 1) + np.eye(n)
-    hinges, slopes = volume_hinges(J, Z, A, 0.9)
+    units = UnitGradients.of(J, A)
+    hinges, slopes = volume_hinges(units, Z, 0.9)
+    slopes = units.pull_back(slopes)
     symbol = ca.SX.sym("J", r, n)
     for k in range(N):
         volume = gradient_volume(symbol, ca.DM(Z[k]), None if A is None else ca.DM(A[k]))
@@ -375,15 +415,19 @@ def test_volumes_by_lapack_are_those_of_the_expression(identity: bool) -> None:
 
 
 @pytest.mark.slow
-def test_loss_with_volumes_is_the_loss() -> None:
-    """The parts written out and by LAPACK together, with exchanged components, against one expression."""
-    sizes, N = Sizes(11, 3, 8, False), 300
-    loss = Loss.of(sizes, {"task": 10.0, "mutual": 3.0, "regularity": 5.0, "folds": 7.0}, ((1, 4),))
+@pytest.mark.parametrize(("angles", "identity", "by_arrays"), [("", False, 2), ("metric ", False, 4), ("", True, 4)])
+def test_loss_by_arrays_is_the_loss(angles: str, identity: bool, by_arrays: int) -> None:
+    """The parts written out and by arrays together, with exchanged components, against one expression."""
+    sizes, N = Sizes(11, 3, 8, identity), 300
+    weights = {f"{angles}task": 10.0, f"{angles}mutual": 3.0, "regularity": 5.0, "folds": 7.0}
+    loss = Loss.of(sizes, weights, ((1, 4),))
     assert len(loss.volume_terms) == 2
+    assert len(loss.array_terms) == by_arrays
     rng = np.random.default_rng(0)
     data = [rng.normal(size=(N, *symbol.shape)) for symbol in loss.symbols()]
-    place = loss.data.index("metric_inverse")
-    data[place] = data[place] @ data[place].transpose(0, 2, 1) + np.eye(sizes.n)
+    if not identity:
+        place = loss.data.index("metric_inverse")
+        data[place] = data[place] @ data[place].transpose(0, 2, 1) + np.eye(sizes.n)
     inputs = [columns.arrange_blocks(rng.normal(size=(N, sizes.r, sizes.n))), *map(columns.arrange_blocks, data)]
     value, slopes = build_loss_with_slopes(loss)(*inputs)
     for found, wanted in zip(build_loss_columns(loss)(*inputs), (value, slopes), strict=True):
