@@ -21,6 +21,7 @@ from arm import random_arm
 from benchmark import table
 from c_timing import nanoseconds_per_call
 from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator
 
 import orthocas as oc
 from orthocas import problems
@@ -116,6 +117,8 @@ def draw(found: list[Measured], file: Path) -> None:
             axes.legend(frameon=False)
         axes.set(xscale="log", yscale="log", xlabel="joints n", title=title)
         axes.set_xticks(n, [str(k) for k in n], minor=False)
+        axes.yaxis.set_major_locator(LogLocator(subs=(1, 2, 5)))
+        axes.yaxis.set_major_formatter("{x:g}")
         axes.minorticks_off()
         axes.grid(alpha=0.3)
     figure.savefig(file, dpi=130)
