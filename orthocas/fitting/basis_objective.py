@@ -576,8 +576,11 @@ class ProductGradients(BasisGradients):
         return np.ascontiguousarray(dense.T).reshape(dense.shape[1], self.n, int(kept.sum()))
 
     def square(self, X: Array, squares: Sequence[Array], kept: NDArray[np.bool_]) -> list[Array]:
-        """Sums of W_j psi' psi'^T, which are far smaller, then D_i on both sides."""
+        """Sums of W_j psi' psi'^T where these are smaller, then D_i on both sides."""
         n, S = self.n, X.shape[2]
+        # where terms have several factors, psi' psi'^T has as many entries as products of gradients
+        if n * (n + 1) // 2 * (S * (S + 1) // 2) >= n * int(kept.sum(axis=1).max()) ** 2:
+            return super().square(X, squares, kept)
         values = X[:, 0].transpose(0, 2, 1).reshape(-1, S)[: len(squares[0])].astype(np.float32)
         # both factors are symmetric: half of their entries
         (i, j), (s, t) = np.triu_indices(n), np.triu_indices(S)
