@@ -766,7 +766,7 @@ static int gives_way(const orthocas_state *state) {
   return state->mode == ORTHOCAS_CATCHER && (state->cause == ORTHOCAS_TOO_FAST || state->cause == ORTHOCAS_TOUCHED);
 }
 
-/* Whether joints are faster than their limits, or on the way there: they accelerate on, half as much on average, until
+/* R35: whether joints are faster than limits, or on the way there: they accelerate on, half as much on average, until
  * the torque that drives them is taken back, which takes time by command_rate. That is what commands have put in and
  * nothing that is felt balances: an arm that presses against a wall, or rebounds from a blow, is not driven by that. */
 static int hurries(const orthocas_arm *arm, orthocas_state *state, double period) {
