@@ -99,7 +99,7 @@ def row_of_many(name: str, robot: oc.Robot, task: oc.Task, home: Array) -> str:
     chart = found.fit.chart
     widths = [joint.half_width for joint in found.joints if joint.reason not in ("idle", "cyclic")]
     verdict = evaluate_chart(chart, 100_000, OTHER_SEED)
-    least = worst_points(chart.problem, chart.coordinates, OTHER_SEED, thorough=True).least
+    least = worst_points(chart.problem, chart.coordinates, OTHER_SEED).least
     return (
         f"| {name} | {chart.n}, {chart.m}, {chart.r} | {seconds:.0f} | {np.exp(np.mean(np.log(widths))):.2f} "
         f"| {verdict.leak_deg:.1f} | {verdict.conditioning:.2f} | {least:.2f} |"

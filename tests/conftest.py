@@ -51,7 +51,7 @@ curve_tracer._FLAGS = (*STRICT, "-O1")
 
 def _search_briefly(value: point_quality.Value, domain: oc.Domain, seed: int = 0) -> Array:
     """As users' search for the fastest and slowest mode of a law, from a twentieth of the candidates."""
-    fewer = replace(point_quality.WORST, candidates=300, descents=12, kept=4, more_steps=80)
+    fewer = replace(point_quality.WORST, candidates=300, descents=12, kept=4, most_pairs=40)
     with patch.object(point_quality, "WORST", fewer):
         return point_quality.least_in_domain(value, domain, seed)
 

@@ -32,11 +32,16 @@ class WorstRules:
     candidates: int = 6000  #: points from which descents may start
     descents: int = 300  #: from the worst of them
     steps: int = 15  #: of each
-    kept: int = 60  #: the worst of these go on, if the result is to be printed
-    more_steps: int = 150  #: of those
+    kept: int = 60  #: the worst of these go on together
+    most_pairs: int = 100  #: of steps of those
+    quiet_pairs: int = 20  #: of steps in turn that gain less than `gain`, after which they end
+    gain: float = 1e-4
     first_step: float = 0.3  #: half-widths
     last_step: float = 1e-4  #: half-widths
     moved: float = 0.4  #: fraction of the joints that move in a step
+    leaders: float = 0.2  #: fraction of the descents that others follow
+    scale: tuple[float, float] = (0.4, 1.0)  #: of steps towards them, least and largest
+    exchanged: tuple[float, ...] = (0.2, 0.5, 0.9)  #: fractions of the joints that move in these
 
     velocities: int = 3  #: seed tag of random velocities of the task
 
@@ -211,14 +216,14 @@ class WorstPoints:
     def explained(self) -> str:
         """The least conditioning and how it was searched."""
         found = f"{self.least:.3f}" if self.least >= 0 else "0, the chart FOLDS OVER"
-        return f"{found} ({len(self.points)} descents from {WORST.candidates} points, many in corners)"
+        return f"{found} ({min(len(self.points), WORST.descents)} descents from {WORST.candidates} points, many in corners)"
 
     def below(self, bound: float) -> Array:
         """Points with less conditioning than that, (l, n)."""
         return self.points[self.conditioning < bound]
 
 
-def worst_points(problem: Problem, coordinates: CoordinateMap, seed: int = 0, *, thorough: bool = False) -> WorstPoints:
+def worst_points(problem: Problem, coordinates: CoordinateMap, seed: int = 0) -> WorstPoints:
     """Search the domain: uniform candidates, others near faces and corners, then descent from the worst (`descended`).
 
     Folds of charts lie in corners and in thin wedges, which uniform samples miss. Points where a gradient vanishes, or
@@ -228,14 +233,13 @@ def worst_points(problem: Problem, coordinates: CoordinateMap, seed: int = 0, *,
         problem: problem of the coordinates.
         coordinates: the coordinates.
         seed: seed of candidates and steps.
-        thorough: follow the worst descents to their ends, for a least value that is printed; fits need bad points only.
     """
     points = sample_boundary_weighted(problem.domain, WORST.candidates, (seed, WORST.candidates, 1))
     u = (points - problem.domain.centre) / problem.domain.half_width
     found = _signed_conditioning(problem, coordinates, u)
     orientation = 1.0 if np.sum(found >= 0) >= np.isfinite(found).sum() / 2 else -1.0
     u, found = descended(
-        lambda u: orientation * _signed_conditioning(problem, coordinates, u), u, orientation * found, seed, thorough
+        lambda u: orientation * _signed_conditioning(problem, coordinates, u), u, orientation * found, seed
     )
     return WorstPoints(_joint_positions(problem, u), found)
 
@@ -243,7 +247,7 @@ def worst_points(problem: Problem, coordinates: CoordinateMap, seed: int = 0, *,
 def least_in_domain(value: Value, domain: Domain, seed: int = 0) -> Array:
     """Where a function of the joint position is least, as far as a search of the domain finds it, q (n,).
 
-    Candidates as in `worst_points`, then thorough descents.
+    Candidates as in `worst_points`, then descents.
 
     Args:
         value: q (N, n) -> (N,); NaN where it has none.
@@ -259,34 +263,47 @@ def least_in_domain(value: Value, domain: Domain, seed: int = 0) -> Array:
         q = domain.centre + domain.half_width * u
         return np.where(domain.contains(q), value(q), np.nan)
 
-    u, _ = descended(inside, (points - domain.centre) / domain.half_width, value(points), seed, thorough=True)
+    u, _ = descended(inside, (points - domain.centre) / domain.half_width, value(points), seed)
     best: Array = domain.centre + domain.half_width * u[0]
     return best
 
 
-def descended(value: Value, u: Array, found: Array, seed: int, thorough: bool) -> tuple[Array, Array]:
+def descended(value: Value, u: Array, found: Array, seed: int) -> tuple[Array, Array]:
     """Descents from the least of many points of the cube [-1, 1]^n; points and values, the least first.
 
     Each is a random search that keeps what is less: a step moves some joints at a time, so that faces and corners are
-    reached, and its size follows success. In 8 joints, gradients by differences cost more.
+    reached, and its size follows success. In 8 joints, gradients by differences cost more. The least descents then go
+    on together, by such steps and by differential evolution in turn: alone, each ends in its own corner, and a box of
+    16 joints has 65,000.
 
     Args:
         value: the function; NaN where it has none.
         u: points (N, n).
         found: its values there, (N,).
         seed: of the steps.
-        thorough: whether the least descents go on until they gain nothing.
+
+    Source:
+        R. Storn, K. Price, "Differential evolution", J. Global Optimization 11 (1997), with steps towards one of the
+        best as in J. Zhang, A. Sanderson, "JADE", IEEE Trans. Evolutionary Computation 13 (2009).
     """
     rng = np.random.default_rng((seed, WORST.candidates))
     order = np.argsort(found)[: min(WORST.descents, int(np.isfinite(found).sum()))]
     u, found, step = u[order], found[order], np.full(len(order), WORST.first_step)
-    # short descents of many, then longer ones of the best
+    # short descents of many
     for _ in range(WORST.steps):
         _step(value, u, found, step, rng)
     order = np.argsort(found)
     u, found, step = u[order], found[order], step[order]
-    for _ in range(WORST.more_steps * thorough):
-        _step(value, u[: WORST.kept], found[: WORST.kept], step[: WORST.kept], rng)
+    # the least of them together, until they gain no more; the places where they began count as well
+    best, least, own = (part[: WORST.kept].copy() for part in (u, found, step))
+    before = [np.inf] * WORST.quiet_pairs
+    for _ in range(WORST.most_pairs):
+        _step(value, best, least, own, rng)
+        _exchange(value, best, least, rng)
+        before.append(least.min(initial=np.inf))
+        if before[-1] > before[-1 - WORST.quiet_pairs] - WORST.gain:
+            break
+    u, found = np.vstack([u, best]), np.concatenate([found, least])
     order = np.argsort(found)
     return u[order], found[order]
 
@@ -294,11 +311,27 @@ def descended(value: Value, u: Array, found: Array, seed: int, thorough: bool) -
 def _step(value: Value, u: Array, found: Array, step: Array, rng: np.random.Generator) -> None:
     """One step of all descents, in place."""
     moves = rng.normal(size=u.shape) * (rng.uniform(size=u.shape) < WORST.moved)
-    tried = np.clip(u + step[:, None] * moves, -1, 1)
-    values = value(tried)
-    less = values < found
-    u[less], found[less] = tried[less], values[less]
+    less = _take_less(value, u, found, u + step[:, None] * moves)
     step[:] = np.maximum(WORST.last_step, step * np.where(less, 1.5, 0.8))
+
+
+def _exchange(value: Value, u: Array, found: Array, rng: np.random.Generator) -> None:
+    """One step of differential evolution, in place: towards one of the best, and along a difference of two others."""
+    if not len(u):
+        return
+    one, other = u[rng.integers(len(u), size=(2, len(u)))]
+    best = u[rng.choice(np.argsort(found)[: max(1, int(WORST.leaders * len(u)))], len(u))]
+    scale, share = rng.uniform(*WORST.scale, (len(u), 1)), rng.choice(WORST.exchanged, (len(u), 1))
+    _take_less(value, u, found, u + scale * (best - u + one - other) * (rng.uniform(size=u.shape) < share))
+
+
+def _take_less(value: Value, u: Array, found: Array, tried: Array) -> NDArray[np.bool_]:
+    """Replace points by those tried, in the cube, whose value is less; which they are."""
+    tried = np.clip(tried, -1, 1)
+    values = value(tried)
+    less: NDArray[np.bool_] = values < found
+    u[less], found[less] = tried[less], values[less]
+    return less
 
 
 def _signed_conditioning(problem: Problem, coordinates: CoordinateMap, u: Array) -> Array:

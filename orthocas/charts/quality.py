@@ -98,7 +98,7 @@ def evaluate(
         drawn = require_count("seed", RULES.seed if seed is None else seed, least=0)
         searched = isinstance(chart.coordinates, Coordinates) and not chart.problem.domain.full_turns
         problem, found = chart.problem, chart.coordinates
-        worst = worst_points(problem, found, drawn, thorough=True) if searched else None
+        worst = worst_points(problem, found, drawn) if searched else None
         return _report(chart, sample_uniform(chart.problem.domain, count, drawn), drawn, worst, collisions, free)
     # or the points that were given, and nothing else
     if samples is not None or seed is not None:

@@ -268,7 +268,7 @@ class Prober:
         zeros, ones = np.zeros(self.outputs), np.ones(self.outputs)
         theta = self._start.on(family)
         coordinates = Coordinates(parametrisation, JointSpace.of(problem), idle, theta, zeros, ones)
-        return worst_points(problem, coordinates, seed, thorough=True).least
+        return worst_points(problem, coordinates, seed).least
 
     def _evaluate(self, problem: Problem, jacobian: Callable[[Array], Array]) -> Quality:
         points = sample_boundary_weighted(problem.domain, RULES.held_out, RULES.seed)

@@ -373,7 +373,7 @@ def _confirm(
             continue
         fit = fit_from(prober.start_on, trial, parametrisation, prober.weights, seed, monitor)
         quality = evaluate_chart(fit.chart, RULES.confirmed, seed + 1)
-        least = worst_points(fit.chart.problem, fit.chart.coordinates, seed + 1, thorough=True).least
+        least = worst_points(fit.chart.problem, fit.chart.coordinates, seed + 1).least
         if least >= enough and quality.keeps(bounds):
             return fit, quality
         worst = describe_conditioning(min(least, quality.conditioning))

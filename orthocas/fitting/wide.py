@@ -406,7 +406,7 @@ def _finish(
     measured = quantities is not None and problem.r == 1
     error = quantities.measure_error(problem, coordinates, seed) if quantities is not None and measured else None
     followed = settings.quantities is not None and solution.coordinates.size > 0 and not measured
-    worst = worst_points(problem, coordinates, seed, thorough=True)
+    worst = worst_points(problem, coordinates, seed)
     terms = settings.weights or {}
     users = terms.for_problem(clear).by_name if isinstance(terms, Weights) else terms
     notes: dict[str, str | float] = {
