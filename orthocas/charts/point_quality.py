@@ -283,8 +283,7 @@ def descended(value: Value, u: Array, found: Array, seed: int) -> tuple[Array, A
         seed: of the steps.
 
     Source:
-        R. Storn, K. Price, "Differential evolution", J. Global Optimization 11 (1997), with steps towards one of the
-        best as in J. Zhang, A. Sanderson, "JADE", IEEE Trans. Evolutionary Computation 13 (2009).
+        differential evolution [SP1997], with steps towards one of the best as in [ZS2009].
     """
     rng = np.random.default_rng((seed, WORST.candidates))
     order = np.argsort(found)[: min(WORST.descents, int(np.isfinite(found).sum()))]
