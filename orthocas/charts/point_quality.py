@@ -216,7 +216,8 @@ class WorstPoints:
     def explained(self) -> str:
         """The least conditioning and how it was searched."""
         found = f"{self.least:.3f}" if self.least >= 0 else "0, the chart FOLDS OVER"
-        return f"{found} ({min(len(self.points), WORST.descents)} descents from {WORST.candidates} points, many in corners)"
+        descents = min(len(self.points), WORST.descents)
+        return f"{found} ({descents} descents from {WORST.candidates} points, many in corners)"
 
     def below(self, bound: float) -> Array:
         """Points with less conditioning than that, (l, n)."""
