@@ -112,7 +112,9 @@ def find_home(robot: Robot, task: Task, home: ArrayLike | str | None = None) -> 
 
 
 def find_joint_range(robot: Robot, margin_deg: float) -> Box:
-    """The box of all joint positions farther than a margin from the limits. Endless joints have a full turn within them.
+    """The box of all joint positions farther than a margin from the limits. Endless joints have a full turn.
+
+    It is within the limits, and the one around 0 if that is.
 
     Raises:
         DomainError: if a joint has no range left.
