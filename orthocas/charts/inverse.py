@@ -18,6 +18,7 @@ from orthocas.charts.newton import Attempt, Continuation, LocalSolver, PhiMap, S
 from orthocas.errors import InvalidValueError, InverseError, NoExpressionError, ShapeError, units_hint
 from orthocas.robots.collisions import Collisions
 from orthocas.tasks.problem import Problem
+from orthocas.tasks.relative import Relative
 from orthocas.tasks.task import Task
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import (
@@ -341,9 +342,8 @@ def beyond_reach(task: Task, x: Array) -> NDArray[np.bool_]:
 
 def measure_excess(task: Task, x: Array) -> Array:
     """How far whole orientations of task values (N, m) lie beyond half a turn, where no rotation is, (N,); else 0."""
-    if task.turn is None or not task.turn.whole:
-        return np.zeros(len(x))
-    excess = task.turn.measure_excess(x)
+    first, end = Relative(task).turns
+    excess = np.linalg.norm(x[:, first:end], axis=1) - 2
     return np.where(excess > 2 * RULES.rounding, excess, 0.0)
 
 

@@ -227,15 +227,13 @@ def _build_newton(chart: Chart) -> Form:
         )
     ]
     # A whole orientation moves with the angular velocity, not with the derivative of its components.
-    rates, turns = "_task_and_slopes", "0:0"
+    rates = "_task_and_slopes"
     if chart.parts.relative.turned:
-        turn, first = problem.task.turn, chart.parts.relative.first
-        turns = f"{first}:{first + (2 if turn is not None and turn.axis else 3)}"
         summary = "Task values, then how fast they move, angular velocities in the tip's axes, (m + m n, N)."
         rates = "_task_and_rates"
         functions.append(write_function(rates, summary, problem.task.function, chart.parts.relative.rates))
     tables = {"centre": domain.centre[:, None], "sizes": chart.parts.phi_sizes[:, None], "bounds": bounds[:, :, None]}
-    return Form("inverse", {"rates": rates, "turns": turns}, "\n\n".join(functions), tables, {})
+    return Form("inverse", {"rates": rates, "turns": chart.parts.relative.turns}, "\n\n".join(functions), tables, {})
 
 
 def _count_rooms(domain: Domain) -> int:

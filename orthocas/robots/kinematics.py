@@ -273,15 +273,6 @@ class TipTurn:
         margin: Array = np.cos(angles / 2)
         return margin
 
-    def measure_excess(self, x: Array) -> Array:
-        """How much longer than 2 = 2 sin(pi / 2) rotation vectors or tilts are, at task values (N, m), (N,).
-
-        No rotation has components of more than half a turn, for which this is positive.
-        """
-        turns = x[:, 3:] if self.with_position else x
-        excess: Array = np.linalg.norm(turns[:, : 3 if self.axis is None else 2], axis=1) - 2
-        return excess
-
 
 def _compute_cosine(sines: ca.SX) -> ca.SX:
     """The positive cosine of half an angle, from sines (3, 1) times an axis; its derivative is finite."""
