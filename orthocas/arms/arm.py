@@ -299,7 +299,8 @@ class Arm(Shown):
         Rows are spread over the cores, in C that is compiled on first use.
 
         Args:
-            x: one task value, or N of them. Rows that are not finite are BAD_INPUT.
+            x: one task value, or N of them. Rows that are not finite are BAD_INPUT, orientations beyond half a turn
+                OUT_OF_REACH.
             xi: a number, or one for each row (N,).
             start: a posture (n,), or one for each row (N, n).
             branch: name of a branch, to accept no other; "any" for all.
@@ -334,10 +335,13 @@ class Arm(Shown):
             self._require_charts()
             values = _repeat_rows("xi", as_float_array("xi", xi).reshape(-1, 1), N)[:, 0]
             good = good & np.isfinite(values)
-        # Rows with numbers that are not finite have their answer already.
+        # Rows with numbers that are not finite, or beyond half a turn, have their answer already.
         q, status = np.full((N, n), np.nan), np.full(N, int(InverseStatus.NOT_FOUND))
         owners = np.full(N, -1)
         status[~good] = InverseStatus.BAD_INPUT
+        beyond = good & self.maps.targets.lack_rotation(targets)
+        status[beyond] = InverseStatus.OUT_OF_REACH
+        good = good & ~beyond
         rows, near = np.flatnonzero(good), None if starts is None else starts[good]
         # Without xi, the arcs of x are searched; with xi, charts first, and then the arcs, in C.
         if values is None:
@@ -558,6 +562,10 @@ class Arm(Shown):
         if not single or not np.isfinite(targets).all():
             raise InvalidValueError(
                 "x", f"{len(targets)} values" if not single else "NaN or infinity", "one task value"
+            )
+        if self.maps.targets.lack_rotation(targets).any():
+            raise InvalidValueError(
+                "x", "an orientation beyond half a turn", "2 sin(angle / 2) axis, of length 2 at most"
             )
         return np.asarray(targets[0])
 

@@ -32,6 +32,7 @@ class MapRules:
     stored: int = 20_000  #: postures from which searches start
     seed: int = 0  #: of them
     least_volume: float = 1e-12  #: det(J J^T) of postures that count as singular
+    no_rotation: float = 1e-8  #: sum of squares above that of rotations: vectors longer than half a turn by 1e-9
 
 
 RULES = MapRules()
@@ -234,6 +235,14 @@ class TargetReader:
             if turn.with_position:
                 targets[good, :3] = vectors[good, :3]
         return targets
+
+    def lack_rotation(self, targets: Array) -> NDArray[np.bool_]:
+        """Which targets (N, k) are of vectors beyond half a turn, which no rotation has, (N,)."""
+        turn = self.task.turn
+        if turn is None or not turn.whole:
+            return np.zeros(len(targets), dtype=bool)
+        # There the formula of Rodrigues gives no rotation, but a matrix with a larger sum of squares.
+        return np.asarray((targets[:, -9:] ** 2).sum(axis=1) > 3 + RULES.no_rotation)
 
     def vector(self, targets: Array) -> Array:
         """Targets (N, k) as vectors of x (N, m); NaN where a target is NaN."""

@@ -470,20 +470,23 @@ class SelfMotions(Shown):
     def _refine(self, k: int, place: float, wish: Array) -> Place:
         """The nearest posture on an arc next to a place of it: secants for (q - wish) . t = 0 along the arc."""
         arc = self.components[k]
-        best, before, slope = Place(wish, np.inf, k, place), (0.0, 0.0), 1.0
-        for number in range(RULES.refinements):
-            q, t = (part[0] for part in arc._stand(np.array([place])))
+        best, pull, slope, trial, step = Place(wish, np.inf, k, place), 0.0, 1.0, place, 0.0
+        for _ in range(RULES.refinements):
+            q, t = (part[0] for part in arc._stand(np.array([trial])))
             away = self.measure_away(q[None], wish)[0]
-            gap, pull = float(np.linalg.norm(away)), float(away @ t)
+            gap, turned = float(np.linalg.norm(away)), float(away @ t)
             # Where the way to the posture is at right angles to the arc, the distance is least.
+            if step:
+                slope = max(
+                    RULES.least_slope, (turned - pull) / step, 0.0 if gap < best.value else 2 * abs(pull / step)
+                )
             if gap < best.value:
-                best = Place(wish + away, gap, k, place)
-            if number > 0 and place != before[0]:
-                slope = max(RULES.least_slope, (pull - before[1]) / (place - before[0]))
-            new = place - float(np.clip(pull / slope, -RULES.largest, RULES.largest))
-            new = new % arc.length if arc.closed else min(max(new, 0.0), arc.length)
-            before, place, moved = (place, pull), new, abs(new - place)
-            if moved < RULES.refined:
+                best, pull = Place(wish + away, gap, k, trial), turned
+            # From the best place so far: one that is farther away makes the next step half as long, or less.
+            new = best.place - float(np.clip(pull / slope, -RULES.largest, RULES.largest))
+            trial = new % arc.length if arc.closed else min(max(new, 0.0), arc.length)
+            step = (new if arc.closed else trial) - best.place
+            if abs(step) < RULES.refined:
                 break
         return best
 

@@ -18,6 +18,7 @@ from orthocas.charts.newton import Attempt, Continuation, LocalSolver, PhiMap, S
 from orthocas.errors import InvalidValueError, InverseError, NoExpressionError, ShapeError, units_hint
 from orthocas.robots.collisions import Collisions
 from orthocas.tasks.problem import Problem
+from orthocas.tasks.relative import Relative
 from orthocas.tasks.task import Task
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import (
@@ -65,7 +66,7 @@ class InverseStatus(IntEnum):
     SINGULAR = 4  #: a solution at which J is singular, so that it need not be unique
     NOT_FOUND = 5  #: no solution was found, which does not prove that there is none; q has the smallest error found
     BAD_INPUT = 6  #: a number of phi or of the start is not finite; q is NaN
-    OUT_OF_REACH = 7  #: no solution: x is farther from the first joint than the arm is long; q as for NOT_FOUND
+    OUT_OF_REACH = 7  #: no solution: x is farther than the arm is long, or turns beyond half a turn; q as for NOT_FOUND
     COLLIDING = 8  #: a solution inside the domain where a pair touches; no free one was found
 
 
@@ -234,6 +235,8 @@ def solve_all(chart: Chart, phi: Array, tolerance: float, collisions: Collisions
     # where full turns change xi, solutions have no end: those within one and a half turns of the centre
     away = np.where(chart.parts.boxed.winding, np.abs(every - domain.home), 0.0)
     every = every[np.asarray((away <= RULES.turned).all(axis=1))]
+    if measure_excess(chart.problem.task, phi[None, : chart.m])[0] > tolerance:
+        every = every[:0]
     # of all that are found, those that differ by more than full turns, the nearest to the centre first
     endless = np.isinf(domain.bounds[0]) & ~np.array(chart.problem.robot.tree.prismatic)
     turns = np.where(endless, 2 * np.pi, 0.0)
@@ -337,6 +340,13 @@ def beyond_reach(task: Task, x: Array) -> NDArray[np.bool_]:
     return np.asarray(np.linalg.norm(away, axis=1) > (1 + RULES.rounding) * length)
 
 
+def measure_excess(task: Task, x: Array) -> Array:
+    """How far whole orientations of task values (N, m) lie beyond half a turn, where no rotation is, (N,); else 0."""
+    first, end = Relative(task).turns
+    excess = np.linalg.norm(x[:, first:end], axis=1) - 2
+    return np.where(excess > 2 * RULES.rounding, excess, 0.0)
+
+
 @dataclass(eq=False)
 class Found:
     """The best points so far."""
@@ -406,6 +416,12 @@ class Inverse:
         if inside:
             kept = np.isin(found.status, (InverseStatus.NEAREST, InverseStatus.OUTSIDE_DOMAIN))
             error[kept] = largest(found.residual[kept, : self._m])
+        # what no rotation has counts as half a turn until here, and q has that
+        excess = measure_excess(self.problem.task, targets[:, : self._m])
+        beyond = good & (excess > tolerance)
+        if beyond.any():
+            found.status[beyond] = InverseStatus.OUT_OF_REACH
+            error[beyond] = np.fmax(error[beyond], excess[beyond])
         return Solutions(found.q, found.status, found.iterations, error, distance, tolerance)
 
     def _search(self, targets: Array, starts: Array | None, tolerance: float, inside: bool) -> Found:

@@ -233,7 +233,7 @@ def _build_newton(chart: Chart) -> Form:
         rates = "_task_and_rates"
         functions.append(write_function(rates, summary, problem.task.function, chart.parts.relative.rates))
     tables = {"centre": domain.centre[:, None], "sizes": chart.parts.phi_sizes[:, None], "bounds": bounds[:, :, None]}
-    return Form("inverse", {"rates": rates}, "\n\n".join(functions), tables, {})
+    return Form("inverse", {"rates": rates, "turns": chart.parts.relative.turns}, "\n\n".join(functions), tables, {})
 
 
 def _count_rooms(domain: Domain) -> int:

@@ -315,6 +315,7 @@ def _describe_chart(chart: Chart, precision: Precision) -> dict[str, Any]:
         "phi_turns": turns,
         "phi_rounds": np.where(turns > 0, 1 / np.where(turns > 0, turns, 1.0), 0.0),
         "turned": chart.parts.relative.turned,
+        "rotation": chart.parts.relative.turns,
     }
 
 

@@ -114,6 +114,8 @@ def find_home(robot: Robot, task: Task, home: ArrayLike | str | None = None) -> 
 def find_joint_range(robot: Robot, margin_deg: float) -> Box:
     """The box of all joint positions farther than a margin from the limits. Endless joints have a full turn.
 
+    It is within the limits, and the one around 0 if that is.
+
     Raises:
         DomainError: if a joint has no range left.
     """
@@ -129,7 +131,9 @@ def find_joint_range(robot: Robot, margin_deg: float) -> Box:
     room = np.where(prismatic, RULES.prismatic_margin * (high - low), margin) * ~missing
     low, high = low + room, high - room
     endless = ~prismatic & (missing | (robot.upper - robot.lower >= 2 * np.pi))
-    low[endless], high[endless] = -np.pi, np.pi
+    # the turn around 0, or the one within the limits that is nearest to it
+    turn = np.clip(0.0, robot.lower + np.pi, robot.upper - np.pi)
+    low, high = np.where(endless, turn - np.pi, low), np.where(endless, turn + np.pi, high)
     empty = np.flatnonzero(low >= high)
     if empty.size:
         name = robot.joint_names[int(empty[0])]

@@ -32,6 +32,14 @@ class Relative:
         self.turned = turn is not None and turn.whole  #: whether x holds a whole orientation
         self.first = task.m - 3 if self.turned else task.m  #: rows before those of the orientation
 
+    @property
+    def turns(self) -> tuple[int, int]:
+        """First row, and the one after the last, of a rotation vector or a tilt; equal: there is none."""
+        turn = self.task.turn
+        if turn is None or not turn.whole:
+            return 0, 0
+        return self.first, self.first + (3 if turn.axis is None else 2)
+
     def difference(self, x_d: Any, x: Any) -> Any:
         """-e: how far x_d is from x, as NumPy rows (..., m) or CasADi columns (m, 1)."""
         if not self.turned:

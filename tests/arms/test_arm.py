@@ -137,6 +137,24 @@ def test_a_branch_can_be_asked_for() -> None:
         arm.solve(arm.x(q), branch="elbow?")
 
 
+def test_no_posture_turns_beyond_half_a_turn() -> None:
+    """x holds 2 sin(angle / 2) axis: 2 is half a turn, and longer ones are of no rotation."""
+    arm, q = panda(), inside(panda(), 1, 7)[0]
+    x = arm.x(q)
+    x[3:] *= 2 / np.linalg.norm(x[3:])
+    longer = np.concatenate([x[:3], 1.05 * x[3:]])
+    for xi in (None, 0.5):
+        found = arm.solve(np.array([x, longer]), xi)
+        assert [InverseStatus(k).name for k in found.status] == ["FOUND", "OUT_OF_REACH"]
+        np.testing.assert_allclose(abs(arm.x(found.q[0])[3:]), abs(x[3:]), atol=1e-6)
+        assert np.isnan(found.q[1]).all()
+    assert len(arm.self_motion(x)) > 0
+    with pytest.raises(InvalidValueError, match="half a turn"):
+        arm.self_motion(longer)
+    with pytest.raises(InvalidValueError, match="half a turn"):
+        arm.solve(longer, 0.5, all=True)
+
+
 def test_rows_that_fail_do_not_disturb_others() -> None:
     arm, q = planar(), np.array([0.3, 0.9, 0.8])
     found = arm.solve([[np.nan, 0.0], arm.x(q), [9.0, 0.0]], start=q)

@@ -200,6 +200,19 @@ def test_nearest_posture_is_nearer_than_dense_samples() -> None:
         assert found.value == pytest.approx(np.linalg.norm(found.q - wish))
 
 
+@pytest.mark.parametrize("reach", [2.9, 2.99, 2.9999])
+def test_nearest_posture_of_a_small_closed_curve(reach: float) -> None:
+    """Of a nearly stretched arm; the distance bends much along it, seen from far away."""
+    arm, rng = planar(), np.random.default_rng(3)
+    motions = arm.self_motion([reach, 0.0])
+    (arc,) = motions
+    assert arc.closed
+    dense = arc.at(np.linspace(0.0, arc.length, 4000))
+    for wish in rng.uniform(-3, 3, (20, 3)):
+        away = np.linalg.norm(motions.measure_away(dense, wish), axis=1).min()
+        assert motions.nearest(wish).value < away + 1e-7
+
+
 def test_best_posture_is_better_than_dense_samples() -> None:
     motions = panda().self_motion(panda().x(postures(panda(), 1, 4)[0]))
     found = motions.best(lambda q: -np.abs(q[:, 2] - 0.3))

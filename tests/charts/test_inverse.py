@@ -1,7 +1,10 @@
 """The inverse map for many rows: a status for each, starts, and all solutions."""
 
+from dataclasses import replace
+
 import casadi as ca
 import numpy as np
+import pinocchio as pin
 import pytest
 from charts import beyond_domain
 from public_objects import circle
@@ -222,6 +225,28 @@ def test_inverse_refuses_what_lies_outside_and_has_the_nearest_inside() -> None:
     np.testing.assert_allclose(caught.value.nearest, [centre, nearest], atol=1e-7)
     with pytest.raises(InvalidValueError, match="outside"):
         chart.inverse(phi, centre, outside=1)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("kind", ["orientation", "orientation:z"])
+def test_no_rotation_is_more_than_half_a_turn_away(kind: str) -> None:
+    """Half a turn, 2 sin(pi / 2), is found; no q has components that are longer."""
+    robot = problems.iiwa_robot()
+    chart = oc.fit(robot, oc.Task.named(robot, kind), parametrisation=oc.Linear(), samples=500).chart
+    q = sample_uniform(chart.problem.domain, 1, 3)[0]
+    # the reference is a little less than half a turn about x, which tilts z, away from the tip
+    almost = pin.exp3(np.array([np.pi - 0.01, 0.0, 0.0]))
+    task = oc.Task.orientation(robot, robot.tip_rotation(q) @ almost, kind[12:] or None)
+    chart = oc.Chart(replace(chart.problem, task=task), chart.coordinates)
+    phi, k = chart.phi(q), 3 if kind == "orientation" else 2
+    np.testing.assert_allclose(np.linalg.norm(phi[:k]), 2 * np.cos(0.005), atol=1e-9)
+    longer = np.concatenate([2.1 / np.linalg.norm(phi[:k]) * phi[:k], phi[k:]])
+    for start in (q, None):
+        found = chart.solve([phi, longer], start)
+        assert found.statuses == (FOUND, oc.InverseStatus.OUT_OF_REACH)
+        assert found.error[1] > 0.099
+    assert chart.solve(longer, q, inside=True).statuses == (oc.InverseStatus.OUT_OF_REACH,)
+    with pytest.raises(InverseError):
+        chart.inverse(longer, q)
 
 
 def test_grown_charts_solve_with_their_own_inverse() -> None:

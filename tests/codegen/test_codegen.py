@@ -94,6 +94,28 @@ def test_chart_on_the_torus_has_no_outside(tmp_path: Path) -> None:
     assert "all joint positions" in (tmp_path / "free_arm.h").read_text()
 
 
+@pytest.mark.parametrize("kind", ["orientation", "orientation:z"])
+def test_no_rotation_is_more_than_half_a_turn_away(iiwa: oc.Problem, tmp_path: Path, kind: str) -> None:
+    """C has no solution for components longer than 2 = 2 sin(pi / 2), and has one for a little less."""
+    robot, q = iiwa.robot, iiwa.domain.centre
+    away = pin.exp3(np.array([np.pi - 0.01, 0.0, 0.0]))  # turns the tip, and tilts its axis
+    task = oc.Task.orientation(robot, robot.tip_rotation(q) @ away, kind[12:] or None)
+    chart = oc.fit(robot, task, parametrisation=oc.Linear(), domain=iiwa.domain, samples=300).chart
+    generated = oc.generate_c(chart, tmp_path, None, "arm")
+    library = CompiledLibrary(compile_shared(generated, tmp_path), "arm", 7)
+    phi, k = chart.phi(q), 3 if kind == "orientation" else 2
+    found, status = library.inverse(phi, q + 0.01)
+    assert status == 0
+    np.testing.assert_allclose(chart.phi(found), phi, atol=1e-8)
+    longer = np.concatenate([phi[:k] * 2.01 / np.linalg.norm(phi[:k]), phi[k:]])
+    for start in q + 0.1 * np.random.default_rng(7).uniform(-1, 1, (50, 7)):
+        found, status = library.inverse(longer, start)
+        assert status == 2  # SINGULAR: no solution
+        np.testing.assert_array_equal(found, start)
+        assert library.nearest(longer, start, 1.0)[1] in (1, 12)  # OUTSIDE_DOMAIN or STOPPED_EARLY: not reached
+    assert library.inverse(longer, np.nan * q)[1] == 3
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("old", "new", "message"),

@@ -159,6 +159,17 @@ def test_poses_beyond_half_a_turn(tmp_path: Path) -> None:
     np.testing.assert_allclose(q, points, rtol=0, atol=1e-9)
 
 
+def test_no_rotation_is_more_than_half_a_turn_away(tmp_path: Path) -> None:
+    """Orientations longer than 2 = 2 sin(pi / 2) have no solution, as for `chart.solve`."""
+    chart = pose()
+    module, points = module_of(chart, "numpy", tmp_path), sample_uniform(chart.problem.domain, 100, 5)
+    phi = chart.phi(points)
+    phi[:, 3:6] *= 2.05 / np.linalg.norm(phi[:, 3:6], axis=1)[:, None]
+    np.testing.assert_array_equal(chart.solve(phi, points).status, InverseStatus.OUT_OF_REACH)
+    np.testing.assert_array_equal(module.inverse(phi, points)[1], NOT_FOUND)
+    np.testing.assert_array_equal(module.nearest_xi(points, phi[:, : chart.m])[1], NOT_FOUND)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("name", ["box", "wide", "circle", "corridor", "pose, wide"])
 @pytest.mark.parametrize("library", ["torch", "jax"])

@@ -1,14 +1,17 @@
 """Default domains of a problem: the middle of the limits where the task is regular, a bent posture elsewhere."""
 
+import dataclasses
+
 import casadi as ca
 import numpy as np
 import pytest
 from conftest import robot_of
+from random_arms import random_arm
 
 import orthocas as oc
 from orthocas.problems import iiwa_robot
 from orthocas.tasks.domains import default_box, require_within_limits
-from orthocas.tasks.regular_box import regular_box
+from orthocas.tasks.regular_box import find_joint_range, regular_box
 
 
 @pytest.mark.parametrize(("name", "kind"), [("panda", "position"), ("panda", "pose"), ("ur10", "position")])
@@ -88,3 +91,16 @@ def test_arms_of_hobbyists_fit_without_folds_on_their_default_domain(name: str) 
     assert fit.worst is not None
     assert fit.worst.least > 0.3
     assert oc.evaluate(fit.chart, 20_000, 1).folded_samples == 0
+
+
+@pytest.mark.parametrize(("low", "high"), [(0.0, 2 * np.pi), (-4.8, 2.9), (-9.0, -1.0), (0.5, np.inf), (-np.inf, 2.0)])
+def test_full_turns_of_joint_ranges_lie_within_the_limits(low: float, high: float) -> None:
+    tree = random_arm(np.random.default_rng(5), 7, slides=0.0).tree
+    lower, upper = tree.lower.copy(), tree.upper.copy()
+    lower[4], upper[4] = low, high
+    robot = oc.Robot(dataclasses.replace(tree, lower=lower, upper=upper))
+    whole = find_joint_range(robot, 0)
+    require_within_limits(robot, whole)
+    np.testing.assert_array_equal(whole.half_width, np.pi)
+    for branch in oc.branches(robot, oc.Task.pose(robot)):
+        require_within_limits(robot, branch.box)
