@@ -347,7 +347,7 @@ def _build_state(
     layout |= dict.fromkeys(names, joints) | dict.fromkeys(("offset", "integral"), quantities)
     if has_spring:
         layout |= dict.fromkeys(("load", "drive", "speed"), joints) | {"inertia": number * n**2}
-        layout |= dict.fromkeys(("expected", "unexplained", "momentum", "trend", "touch"), joints)
+        layout |= dict.fromkeys(("expected", "unexplained", "momentum", "trend", "touch", "carried"), joints)
     # Laws that remember have their fields before the last reference.
     if memory._fields_:
         layout["memory"] = memory

@@ -1,5 +1,5 @@
 /* The runtime alone, under a made-up arm whose kernels do what a test asks them: NaN, singular matrices, overflow. It goes
- * through what no robot does every day, and counts branches (R1 to R34 of docs/reference/runtime.md).
+ * through what no robot does every day, and counts branches (R1 to R36 of docs/reference/runtime.md).
  *
  * Three joints with unit inertia; the third one turns without end. phi = (atan(q0), q1, q2), undefined where |q0| > 50;
  * the law is a spring and a damper. Exits with the number of failed checks, and prints their lines. */
@@ -295,7 +295,7 @@ static void open_all(const orthocas_arm *which) {
                                         &state.impulse, &state.impulse_from, &state.law, &state.anchor, &state.safe,
                                         &state.limit, &state.offset, &state.integral, &state.load, &state.drive,
                                         &state.speed, &state.expected, &state.unexplained, &state.momentum, &state.trend,
-                                        &state.touch,
+                                        &state.touch, &state.carried,
                                         &state.reference.value, &state.reference.velocity,
                                         &state.reference.acceleration};
   size_t i;
@@ -602,6 +602,29 @@ static void test_sensors(void) {
       seen |= step(1e-3) == ORTHOCAS_BAD_INPUT;
     }
     CHECK(k == 2 || seen == (k < 2 || !arm->torque));
+  }
+  /* Sensors that freeze in motion and report no speed: found unless friction can have stopped the arm, or it was
+   * slow. The command goes back, and the arm is as fast as it was. */
+  for (k = 0; k < 4; ++k) {
+    double before;
+    int tick;
+    start_law(arm);
+    set(settings[18], k == 1 ? 100.0 : 1.0, 1.0, 1.0);
+    if (k == 3) set(settings[9], 50.0, 50.0, 50.0);
+    set(dq, k == 2 ? 0.015 : 0.3, 0, 0);
+    for (tick = 0; tick < 40; ++tick) {
+      (void)step(1e-3);
+      q[0] += 1e-3 * dq[0];
+    }
+    before = command[0];
+    dq[0] = 0.0;
+    fault.law = 1.0;
+    for (tick = 0; tick < 8; ++tick) {
+      const int status = (wiggle = 1, step(1e-3));
+      CHECK((status == ORTHOCAS_BAD_INPUT) == (arm->torque && k == 0 && tick >= 5));
+    }
+    CHECK(!(arm->torque && k == 0) || (state.dq[0] > 0.2 && fabs(command[0] - before) < 1e-9));
+    CHECK(state.mode == ORTHOCAS_LAW);
   }
   start_law(arm);
   (void)steps(2);

@@ -11,7 +11,7 @@ from supervised import TICK, Arm, at_rest, moving, run
 import orthocas as oc
 from orthocas.codegen import CompiledLibrary, GeneratedC, Supervisor, compile_shared
 from orthocas.control import Controller, ControlStatus, PDPlus, Safety
-from orthocas.simulation import MuJoCoPlant
+from orthocas.simulation import Friction, MuJoCoPlant, StickingPlant
 from orthocas.tools.checks import Array
 
 pytestmark = needs_c
@@ -126,17 +126,62 @@ def test_the_same_measurement_of_a_moving_arm_is_missing_after_five_ticks(
 ) -> None:
     chart, q = planar_for_control, planar_for_control.problem.domain.centre
     for dq in (np.array([0.0, 1e-3, 0.0]), np.array([-0.5, 0.0, 0.0])):
-        settled(supervisor, chart, q)
+        held = settled(supervisor, chart, q)
         for k in range(17):
             command, status = supervisor.step(q, dq, at_rest(chart, q), TICK)
             assert (status is ControlStatus.BAD_INPUT) == (k >= 5)
-            if k == 4:
-                before = command
-            if 5 <= k < 15:
-                np.testing.assert_array_equal(command, before)
+            # Back to what was commanded when they changed last, at the usual rate.
+            if 10 <= k < 15:
+                np.testing.assert_array_equal(command, held)
         assert supervisor.mode == 1  # the catcher, after hold_ticks
         assert supervisor.step(q, dq + 1e-9, at_rest(chart, q), TICK)[1] is ControlStatus.CAUGHT
         assert supervisor.cause == ControlStatus.BAD_INPUT
+
+
+def test_sensors_that_freeze_in_motion_and_report_no_speed_do_not_make_the_arm_fast(
+    supervised_library: CompiledLibrary, supervised_law: Controller, planar_for_control: oc.Chart
+) -> None:
+    """A law that sees no speed pushes on. Friction could have stopped the arm later, but not so soon."""
+    chart, q = planar_for_control, planar_for_control.problem.domain.centre
+    dq, found = np.array([0.3, -0.3, 0.3]), {}
+    for friction in (2.0, 1e3):  # as it is, and as if the arm could stop at once
+        arm = Arm(chart.problem.robot, q, dq)
+        supervisor = Supervisor(supervised_library, supervised_law, Safety.of(supervised_law, friction=friction))
+        supervisor.take_over(q, chart.problem.robot.gravity(q))
+        statuses, fastest = [], 0.0
+        for k in range(300):
+            if k <= 100:
+                seen = arm.q, arm.dq if k < 100 else 0 * dq
+            command, status = supervisor.step(*seen, moving(chart, q + k * TICK * dq, dq), TICK)
+            arm.move(command)
+            assert (supervisor.mode == 0) or k > 100
+            if k >= 100:
+                statuses.append(status)
+                fastest = max(fastest, float(np.abs(arm.dq).max()))
+        bad = np.array(statuses) == ControlStatus.BAD_INPUT
+        found[friction] = fastest, int(bad.argmax()) if bad.any() else 200
+    assert found[2.0][1] == 5
+    assert found[2.0][0] < 1.0
+    assert found[1e3][0] > 3.0
+    assert found[1e3][1] > 10
+
+
+def test_an_arm_that_friction_stops_measures_the_same_without_a_fault(
+    supervised_library: CompiledLibrary, supervised_law: Controller, planar_for_control: oc.Chart
+) -> None:
+    """Joints with the friction that the settings state stop within some ticks, and stick."""
+    chart, q = planar_for_control, planar_for_control.problem.domain.centre
+    friction = Safety.of(supervised_law).friction
+    plant = StickingPlant(chart.problem.robot, friction=Friction(coulomb=0.9 * friction, breakaway=friction))
+    for speed in (0.02, 0.05, 0.1):
+        supervisor = Supervisor(supervised_library, supervised_law)
+        plant.reset(q, np.array([speed, -speed, speed]))
+        supervisor.take_over(q, chart.problem.robot.gravity(q))
+        for k in range(150):
+            command, status = supervisor.step(plant.q, plant.dq, at_rest(chart, q), TICK)
+            assert status is not ControlStatus.BAD_INPUT, (speed, k)
+            plant.step(command, TICK)
+        assert supervisor.same_ticks > 20
 
 
 @pytest.mark.slow

@@ -1,8 +1,8 @@
 /* orthocas_runtime.c: chart, inverse map, and the law under supervision, for any robot and law.
  *
- * Read it from top to bottom: constants; numbers; chart and dynamics; inverse map; then the supervised law: its modes as
- * a table, its boundary, its sensors, its references, its modes in code, the catcher, memory, one tick; and references
- * of programs. R1 to R34 are requirements; docs/reference/runtime.md says which tests check which.
+ * Read it from top to bottom: constants; numbers; chart and dynamics; inverse map; the supervised law: its modes as a
+ * table, boundary, sensors, modes in code, references, catcher, memory, one tick; references of programs. R1 to R36 are
+ * requirements; docs/reference/runtime.md says which tests check which.
  *
  * C99, no global variables, no heap, no input, no output. Every array has the size that orthocas_runtime.h says; local
  * arrays are places in `work`, which a caller owns.
@@ -21,7 +21,7 @@ static const struct {
   int halvings;
 #ifndef ORTHOCAS_CHART_ONLY
   double turn, longest, implausible, jitter, alike, stirring, slowest, standing, room, nearly, slow, settling, giving;
-  double learning, lifted, touching, far_off, deep, hasty, stopping, trend, contact;
+  double growing, forgetting, learning, lifted, touching, far_off, deep, hasty, stopping, trend, contact;
   int forever, bisections, sweeps;
 #endif
 } rules = {
@@ -40,6 +40,8 @@ static const struct {
   .slow = 1.0 / 3.0,         /* share of the speed limit of a joint on the way back, and as a law takes over */
   .settling = 0.5,           /* time constant with which the last part of the offset fades [s] */
   .giving = 0.02,            /* share of the spring or load that a fast arm takes away in a tick */
+  .growing = 0.25,           /* share of what torques can do by which speeds grow that sensors must go on to show */
+  .forgetting = 0.1,         /* share of a loss of speed that counts though no torque explains it, as by blows, walls */
   .learning = 2.0,           /* rate at which the load is learned, slower than the catcher's modes [1/s] */
   .lifted = 0.5,             /* largest load, in limits of the command: the other half is for motion */
   .touching = 60.0,          /* rate at which contacts are felt, faster than loads are learned [1/s] */
@@ -97,25 +99,23 @@ static void swap(double *x, double *y) {
   *y = kept;
 }
 
-/* Solve A x = b for `count` columns b, one after the other, by Gaussian elimination with pivoting. Overwrites A, and b
- * with x. Returns 0 if A is singular. */
+/* Solve A x = b for `count` columns b by elimination with pivoting; x replaces b. Returns 0 if A is singular. */
 static int solve(const orthocas_arm *arm, double *A, double *b, int size, int count) {
   const double *end = b + count * size;
-  double *x;
   for (int k = 0; k < size; ++k) {
     int pivot = k;
     for (int i = k + 1; i < size; ++i)
       if (fabs(A[i * size + k]) > fabs(A[pivot * size + k])) pivot = i;
     if (!(fabs(A[pivot * size + k]) > arm->numbers.pivot)) return 0;
     for (int j = k; j < size && pivot > k; ++j) swap(A + k * size + j, A + pivot * size + j);
-    for (x = b; x < end; x += size) swap(x + k, x + pivot);
+    for (double *x = b; x < end; x += size) swap(x + k, x + pivot);
     for (int i = k + 1; i < size; ++i) {
       double factor = A[i * size + k] / A[k * size + k];
       for (int j = k + 1; j < size; ++j) A[i * size + j] -= factor * A[k * size + j];
-      for (x = b; x < end; x += size) x[i] -= factor * x[k];
+      for (double *x = b; x < end; x += size) x[i] -= factor * x[k];
     }
   }
-  for (x = b; x < end; x += size)
+  for (double *x = b; x < end; x += size)
     for (int i = size - 1; i >= 0; --i) {
       for (int j = i + 1; j < size; ++j) x[i] -= A[i * size + j] * x[j];
       x[i] /= A[i * size + i];
@@ -174,8 +174,7 @@ ORTHOCAS_API int orthocas_dynamics(const orthocas_arm *arm, const double *q, con
 
 /* ---- the inverse map ---- */
 
-/* residual = wanted - phi(q) and the Jacobian, with rows divided by the sizes of the components. Returns the largest
- * entry of the residual, or -1 where phi is undefined. */
+/* residual = wanted - phi(q) and Jacobian, in sizes of components. Returns its largest entry; -1: phi is undefined. */
 static double residual_at(const orthocas_arm *arm, const double *wanted, const double *q, double *residual,
                           double *jacobian, double *work) {
   const int n = arm->n;
@@ -197,8 +196,7 @@ static double residual_at(const orthocas_arm *arm, const double *wanted, const d
 }
 
 /* Newton's method with line search from q for phi(q) = wanted, with so many evaluations left after the first one, which
- * it counts down to 0 if they are not enough. Returns the largest error at the q that it reaches, in sizes of the
- * components, or -1 where phi is undefined. */
+ * it counts down to 0 if they are not enough. Returns the largest error at the q that it reaches, or -1, likewise. */
 static double search(const orthocas_arm *arm, const double *wanted, double *q, int *left, double *work) {
   const int n = arm->n;
   double *next = take(&work, n), *step = take(&work, n), *residual = take(&work, n), *jacobian = take(&work, n * n);
@@ -301,14 +299,12 @@ static void least_move(const orthocas_arm *arm, const double *H, const double *g
     if (!solve(arm, K, x, system, 1)) return;
     for (int k = 0; k < rows; ++k) {
       const double along = dot(slopes + k * n, x, n);
-      double part;
       if (held[k] || !(fabs(along) > arm->reaching.still)) continue;
-      part = ((along < 0.0 ? low[k] : high[k]) - dot(slopes + k * n, d, n)) / along;
-      if (part < share) {
-        share = part;
-        first = k;
-        side = along < 0.0 ? -1 : 1;
-      }
+      const double part = ((along < 0.0 ? low[k] : high[k]) - dot(slopes + k * n, d, n)) / along;
+      if (!(part < share)) continue;
+      share = part;
+      first = k;
+      side = along < 0.0 ? -1 : 1;
     }
     for (int i = 0; i < n; ++i) d[i] += fmax(share, 0.0) * x[i];
     if (first >= 0) {
@@ -317,10 +313,8 @@ static void least_move(const orthocas_arm *arm, const double *H, const double *g
     }
     for (int k = 0; k < rows; ++k) {
       const double outwards = held[k] > 0 ? x[n + k] : held[k] < 0 ? -x[n + k] : 0.0;
-      if (outwards > wrong) {
-        wrong = outwards;
-        first = k;
-      }
+      if (outwards > wrong) first = k;
+      wrong = fmax(wrong, outwards);
     }
     if (first < 0) return;
     held[first] = 0;
@@ -342,10 +336,8 @@ static int step_inside(const orthocas_arm *arm, const vicinity *now, const doubl
       double square = 0.0;
       if (next->rooms[k] >= enough) continue;
       beyond = 1;
-      for (int i = 0; i < n; ++i) {
-        const double slope = now->inwards[i * rooms + k] * width[i];
-        square += slope * slope;
-      }
+      for (int i = 0; i < n; ++i)
+        square += now->inwards[i * rooms + k] * width[i] * (now->inwards[i * rooms + k] * width[i]);
       for (int i = 0; i < n; ++i)
         q[i] += now->inwards[i * rooms + k] * width[i] * width[i] * (2.0 * enough - next->rooms[k]) / square;
     }
@@ -370,7 +362,6 @@ static int descend(const orthocas_arm *arm, const double *wanted, double longest
     low[i] = fmin(fmax(arm->lower[i], q[i] - longest), q[i]);
     high[i] = fmax(fmin(arm->upper[i], q[i] + longest), q[i]);
   }
-  copy(to, q, n);
   look_at(arm, q, wanted, now);
   if (now->cost < 0.0) return 0;
   damping = arm->reaching.damping * sqrt(dot(now->e, now->e, arm->m));
@@ -425,19 +416,18 @@ static int descend(const orthocas_arm *arm, const double *wanted, double longest
 ORTHOCAS_API int orthocas_nearest(const orthocas_arm *arm, const double *phi, const double *q_start, double largest_step,
                                   double *q, double *work, int *held) {
   const int n = arm->n;
-  double *wanted = take(&work, n), *start = take(&work, n), *now = take(&work, n), error, longest = 0.0;
+  double *wanted = take(&work, n), *now = take(&work, n), error, longest = 0.0;
   int left = ORTHOCAS_EVALUATIONS / 4;
   if (!all_finite(arm, phi, n) || !all_finite(arm, q_start, n) || !(largest_step > 0.0)) {
     set_zero(q, n);
     return ORTHOCAS_NOT_FINITE;
   }
   copy(wanted, phi, n);
-  copy(start, q_start, n);
-  copy(now, start, n);
-  copy(q, start, n);
+  copy(now, q_start, n);
+  copy(q, now, n);
   if (!inside(arm, q)) return ORTHOCAS_SINGULAR;
   error = search(arm, wanted, now, &left, work);
-  for (int i = 0; i < n; ++i) longest = fmax(longest, fabs(now[i] - start[i]));
+  for (int i = 0; i < n; ++i) longest = fmax(longest, fabs(now[i] - q[i]));
   if (error >= 0.0 && error <= arm->numbers.solved && longest <= largest_step && inside(arm, now)) {
     copy(q, now, n);
     return ORTHOCAS_OK;
@@ -521,16 +511,14 @@ static void fallback_at(const orthocas_arm *arm, const double *q, const void *ga
 /* R5: settings that are NaN, negative, infinite where they must not be, or out of order, are not used; the last good
  * ones hold. The last of each list are those of torque laws. */
 ORTHOCAS_API int orthocas_check_settings(const orthocas_arm *arm, const orthocas_safety *safety) {
-  const double *infinite[] = {safety->start_mismatch, safety->command_rate,    safety->speed_limit,
-                              safety->stuck_speed,    safety->reference_speed, safety->reference_acceleration,
-                              safety->friction,       safety->contact_torque};
-  const double *finite[] = {safety->rest_speed,   safety->stop_stiffness, safety->observer_rate, safety->stop_zone,
-                            safety->stop_damping, safety->brake_yield,    safety->encoder_step};
+  const double *infinite[] = {safety->start_mismatch, safety->command_rate, safety->speed_limit, safety->stuck_speed,
+    safety->reference_speed, safety->reference_acceleration, safety->friction, safety->contact_torque};
+  const double *finite[] = {safety->rest_speed, safety->stop_stiffness, safety->observer_rate, safety->stop_zone,
+    safety->stop_damping, safety->brake_yield, safety->encoder_step};
   const double *of_quantities[] = {safety->offset_rate, safety->integral_rate, safety->integral_limit};
-  const double positive[] = {safety->near_margin,  safety->catch_margin,   safety->return_margin,
-                             safety->fade_in,      safety->fade_out,       safety->return_speed,
-                             safety->damping,      safety->longest_period, safety->brake_stiffness,
-                             safety->energy_rate};
+  const double positive[] = {safety->near_margin, safety->catch_margin, safety->return_margin, safety->fade_in,
+    safety->fade_out, safety->return_speed, safety->damping, safety->longest_period, safety->brake_stiffness,
+    safety->energy_rate};
   const double any = INFINITY, most = arm->numbers.largest;
   const int n = arm->n, torque = arm->torque;
   int good = all_from(-any, safety->lower, n, any) && all_from(-any, safety->upper, n, any);
@@ -550,15 +538,12 @@ static double way_from_path(const orthocas_boundary *path, const double *q, doub
   double *apart = take(&work, path->counted), nearest = INFINITY;
   for (int k = 0; k < path->lines; ++k) {
     const double *start = path->line_start + k * path->counted, *axis = path->line_axis + k * path->counted;
-    double along, square;
     for (int i = 0; i < path->counted; ++i) apart[i] = q[path->joints[i]] / path->radius[i] - start[i];
-    along = fmin(fmax(dot(apart, axis, path->counted), 0.0), path->line_length[k]);
+    const double along = fmin(fmax(dot(apart, axis, path->counted), 0.0), path->line_length[k]);
     for (int i = 0; i < path->counted; ++i) apart[i] -= along * axis[i];
-    square = dot(apart, apart, path->counted);
-    if (square < nearest) {
-      nearest = square;
-      copy(way, apart, path->counted);
-    }
+    const double square = dot(apart, apart, path->counted);
+    if (square < nearest) copy(way, apart, path->counted);
+    nearest = fmin(nearest, square);
   }
   return sqrt(nearest);
 }
@@ -608,8 +593,7 @@ static double clearance(const orthocas_arm *arm, const double *q, double *work) 
   return arm->kernels.room_to_fold != 0 ? fmin(arm->kernels.room_to_fold(q), room) : room;
 }
 
-/* Distance to the boundary of the domain in half-widths, or the clearance, after a time at the present speed; negative
- * outside. clear: the clearance at q. */
+/* Distance to the boundary in half-widths, or the clearance (at q: clear), after a time at this speed; < 0 outside. */
 static double distance(const orthocas_arm *arm, const double *q, const double *dq, double time, double clear,
                        double *work) {
   double *ahead = take(&work, arm->n), nearest = clear;
@@ -667,33 +651,65 @@ static int later(int ticks, double period) {
   return ticks < rules.forever ? ticks + (int)fmax(1.0, fmin(1e3 * period + 0.5, 1e3)) : ticks;
 }
 
+/* The time of a tick and of so many before it. */
+static double lasted(int ticks, double period) { return period * (1.0 + (double)ticks / (double)later(0, period)); }
+
 /* R7: a measurement can be true if it is finite, not absurdly fast, and near the last good one, if that is not old. */
 static int plausible(const orthocas_arm *arm, const orthocas_state *state, const double *q, const double *dq,
                      double period) {
   const orthocas_safety *safety = state->safety;
-  const double since = period * (1.0 + (double)state->bad_ticks / (double)later(0, period));
+  const int recent = state->bad_ticks < safety->hold_ticks || state->bad_ticks <= later(0, period);
   int odd = faster_than(arm, dq, safety->speed_limit, rules.implausible);
-  for (int i = 0; i < arm->n; ++i)
-    if ((state->bad_ticks < safety->hold_ticks || state->bad_ticks <= later(0, period)) &&
-        fabs(between(arm, i, unturned(arm, state, i, q[i]) - state->q[i])) >
-            rules.implausible * safety->speed_limit[i] * since + rules.jitter)
-      odd = 1;
+  for (int i = 0; i < arm->n && recent; ++i)
+    odd = odd || fabs(between(arm, i, unturned(arm, state, i, q[i]) - state->q[i])) >
+                     rules.implausible * safety->speed_limit[i] * lasted(state->bad_ticks, period) + rules.jitter;
   return !odd || moved_as_told(arm, state, q, dq);
 }
 
-/* R8: sensors stand still if this is the last measurement once more, bit by bit, although the arm moves, or must have
- * moved under what was commanded meanwhile. An arm at rest may measure the same for ever. */
-static int frozen(const orthocas_arm *arm, const orthocas_state *state, const double *dq, double *work) {
+/* Whether dq is what the robot measures: an observer makes it from counts, whose differences are rough. */
+static int measures_speeds(const orthocas_arm *arm, const orthocas_state *state) {
+  int measured = arm->torque;
+  for (int i = 0; i < arm->n && measured; ++i) measured = !(state->safety->observer_rate[i] > 0.0);
+  return measured;
+}
+
+/* R36: the share, at most 1, of a change of speeds (n,) that friction and the last command can bring in a time t. */
+static double possible(const orthocas_arm *arm, const orthocas_state *state, const double *v, double t, double *work) {
+  double *change = take(&work, arm->n), share = 1.0;
+  multiply(state->inertia, v, change, arm->n);
+  for (int i = 0; i < arm->n; ++i) /* 0 / 0 counts for nothing */
+    share = fmin(share, (state->safety->friction[i] + fabs(state->drive[i])) * t / fabs(change[i]));
+  return share;
+}
+
+/* Speeds that the arm must have follow measured ones no faster, and grow so slowly that single counts make none fast. */
+static void carry(const orthocas_arm *arm, orthocas_state *state, const double *dq, double period, double *work) {
+  double *way = take(&work, arm->n), share, time = rules.growing * period;
+  for (int i = 0; i < arm->n; ++i) way[i] = dq[i] - state->carried[i];
+  const int slower = dot(way, state->carried, arm->n) < 0.0;
+  if (slower) time = lasted(state->same_ticks + state->bad_ticks, period);
+  share = fmax(slower ? rules.forgetting : 0.0, possible(arm, state, way, time, work));
+  for (int i = 0; i < arm->n; ++i) state->carried[i] += share * way[i];
+}
+
+/* R8: sensors stand still if they repeat the last measurement, bit by bit, though the arm moves, must have moved by what
+ * was commanded, or (R36) was not slow and cannot have stopped since. Arms at rest may repeat it for ever. */
+static int frozen(const orthocas_arm *arm, const orthocas_state *state, const double *dq, double period, double *work) {
   const orthocas_safety *safety = state->safety;
+  const double time = lasted(state->same_ticks - state->bad_ticks, period);
   double *speed = take(&work, arm->n);
   if (state->same_ticks < safety->stale_ticks) return 0;
+  if (measures_speeds(arm, state) && state->mode != ORTHOCAS_HOLD &&
+      faster_than(arm, state->carried, safety->rest_speed, rules.slowest) &&
+      possible(arm, state, state->carried, time, work) < 1.0)
+    return 1;
   /* The speed that the joints have got by state->impulse; of velocity laws, their way. */
   copy(speed, state->impulse, arm->n);
   if (arm->torque) divide_by_inertia(arm, state->inertia, speed, work);
   return faster_than(arm, dq, safety->rest_speed, rules.stirring) || faster_than(arm, speed, safety->stuck_speed, 1.0);
 }
 
-/* Look at a measurement. Returns whether it can be used. */
+/* Look at a measurement. Returns 1 if it can be used, -1 if it stands still while the arm is as fast as it was. */
 static int look(const orthocas_arm *arm, orthocas_state *state, const double *q, const double *dq, double period,
                 double *work) {
   const int n = arm->n;
@@ -702,15 +718,21 @@ static int look(const orthocas_arm *arm, orthocas_state *state, const double *q,
   good = plausible(arm, state, q, dq, period);
   for (int i = 0; i < n; ++i)
     if (fabs(q[i] - state->seen_q[i]) > 0.0 || fabs(dq[i] - state->seen_dq[i]) > 0.0) same = 0;
+  if (!same && good) set_zero(state->impulse, n);
+  if (!same && good && arm->torque) {
+    carry(arm, state, dq, period, work);
+    copy(state->impulse_from, state->command, n);
+    set_zero(state->momentum, n);
+  }
+  state->same_ticks = same ? later(state->same_ticks, period) : good ? 0 : state->same_ticks;
   copy(state->seen_q, q, n);
   copy(state->seen_dq, dq, n);
   state->unseen = 0.0;
-  if (!same && good) {
-    state->same_ticks = 0;
-    set_zero(state->impulse, n);
-    if (arm->torque) set_zero(state->momentum, n);
-  } else if (same) state->same_ticks = later(state->same_ticks, period);
-  return good && !frozen(arm, state, dq, work);
+  if (!frozen(arm, state, dq, period, work)) return good;
+  if (!measures_speeds(arm, state)) return 0;
+  if (state->bad_ticks == 0 && !faster_than(arm, dq, state->safety->rest_speed, rules.stirring))
+    copy(state->dq, state->carried, n);
+  return -1;
 }
 
 /* Add up the momentum that an arm must have got since its measurements changed: the command then, or the fallback, may
@@ -718,7 +740,7 @@ static int look(const orthocas_arm *arm, orthocas_state *state, const double *q,
 static void watch_sensors(const orthocas_arm *arm, orthocas_state *state, const double *fallback, const double *command,
                           double period) {
   double *from = state->impulse_from;
-  if (arm->torque && (state->same_ticks == 0 || state->mode == ORTHOCAS_HOLD)) copy(from, command, arm->n);
+  if (arm->torque && state->mode == ORTHOCAS_HOLD) copy(from, command, arm->n);
   for (int i = 0; i < arm->n; ++i) {
     const double held = arm->torque ? state->safety->friction[i] : 0.0;
     const double least = fmin(from[i], fallback[i]) - held, most = fmax(from[i], fallback[i]) + held;
@@ -841,8 +863,7 @@ static void choose_mode(const orthocas_arm *arm, orthocas_state *state, int law,
 /* ---- the reference of the law ---- */
 
 /* R13: take a reference if it can be followed: finite, and not standing still for long while it claims to move. If not,
- * the last one comes to rest, and its value holds. measured, error: those of the value; change: its difference from the
- * last one. Returns whether it is good. */
+ * the last one comes to rest, and its value holds. measured, error: those of the value; change: from the last one. */
 static int take_reference(const orthocas_arm *arm, orthocas_state *state, const double *shared,
                           const orthocas_reference *reference, double period, double *measured, double *error,
                           double *change, double *work) {
@@ -882,8 +903,7 @@ static int take_reference(const orthocas_arm *arm, orthocas_state *state, const 
   return 0;
 }
 
-/* How joints move (3 n,) with a change of the quantities, and with velocity and acceleration of a reference. Returns 0
- * where that is not known. */
+/* How joints move (3 n,) with a change of quantities, velocity and acceleration of a reference. Returns 0: not known. */
 static int joints_of(const orthocas_arm *arm, const double *q, const double *dq, const double *shared,
                      const orthocas_reference *reference, const double *change, double *motion, double *work) {
   const int n = arm->n;
@@ -921,8 +941,7 @@ static void slow_down(const orthocas_arm *arm, const orthocas_reference *referen
   }
 }
 
-/* R14: the law gets a reference that is no farther from the arm than error_limit: shifted by the fading offset and the
- * integral action. */
+/* R14: the law gets a reference no farther off than error_limit, shifted by fading offset and integral action. */
 static void shift_reference(const orthocas_arm *arm, const orthocas_state *state, const double *measured,
                             const double *error, const orthocas_reference *shifted, double *work) {
   copy(shifted->value, state->reference.value, 3 * arm->k);
@@ -956,8 +975,7 @@ static void govern(const orthocas_arm *arm, orthocas_state *state, const double 
   slow_down(arm, shifted, pace);
 }
 
-/* R16: fade the offset on a straight line, with no component faster than its rate, nor all together. It waits where that
- * would lead the arm on towards a boundary that is near. */
+/* R16: fade the offset on a straight line, none faster than its rate. It waits if that leads to a near boundary. */
 static void fade_offset(const orthocas_arm *arm, orthocas_state *state, const double *shared, double clear, double room,
                         double period, double *work) {
   double *motion = take(&work, 3 * arm->n), *back = take(&work, arm->k), needed = rules.settling;
@@ -1057,17 +1075,15 @@ static void compose_torque(const orthocas_arm *arm, orthocas_state *state, doubl
                            double *work) {
   const orthocas_safety *safety = state->safety;
   const double near = (safety->near_margin - room) / (safety->near_margin - safety->catch_margin);
-  const double damping = safety->damping * fmax(1.0 - state->weight, fmin(fmax(near, 0.0), 1.0));
+  const double fading = 1.0 - state->weight, damping = safety->damping * fmax(fading, fmin(fmax(near, 0.0), 1.0));
   double *spring = take(&work, arm->n), *wanted = take(&work, arm->n), *moved = take(&work, arm->n);
   (void)orthocas_dynamics(arm, state->q, state->dq, M, bias, gravity);
   learn_load(arm, state, M, period, fallback, work);
   brake_at(arm, state, M, spring, work);
   for (int i = 0; i < arm->n; ++i) wanted[i] = stop_at(safety, i, state->q[i], state->dq[i]) - damping * state->dq[i];
   multiply(M, wanted, moved, arm->n);
-  for (int i = 0; i < arm->n; ++i) {
-    command[i] = fallback[i] + state->weight * state->law[i] + moved[i] - spring[i];
-    command[i] += (1.0 - state->weight) * state->load[i];
-  }
+  for (int i = 0; i < arm->n; ++i)
+    command[i] = fallback[i] + state->weight * state->law[i] + moved[i] - spring[i] + fading * state->load[i];
 }
 
 /* Velocity = weight times law + way to the anchor, no faster towards a joint limit than the distance allows (R19). */
@@ -1133,10 +1149,8 @@ static void observe(const orthocas_arm *arm, orthocas_state *state, double *q, d
 /* What it expects of a command: M ddq = command - fallback - C dq, since the fallback holds an arm at rest. */
 static void expect(const orthocas_arm *arm, orthocas_state *state, const double *command, const double *fallback,
                    const double *M, const double *bias, const double *gravity, double *work) {
-  int used = 0;
   for (int i = 0; i < arm->n; ++i) state->drive[i] = command[i] - fallback[i] - (bias[i] - gravity[i]);
-  for (int i = 0; i < arm->n; ++i) used = used || state->safety->observer_rate[i] > 0.0;
-  if (!used || state->mode == ORTHOCAS_HOLD) return;
+  if (measures_speeds(arm, state) || state->mode == ORTHOCAS_HOLD) return;
   copy(state->expected, state->drive, arm->n);
   divide_by_inertia(arm, M, state->expected, work);
   for (int i = 0; i < arm->n; ++i) state->expected[i] += state->unexplained[i];
@@ -1156,8 +1170,7 @@ static void learn_from_start(const orthocas_arm *arm, orthocas_state *state, con
   }
 }
 
-/* Bring the memory up to date after a command. active: weight of the law in it. period: 0 after missing measurements.
- * What is not finite keeps its last value. */
+/* Bring the memory up to date after a command, but for what is not finite. active: weight of the law; period: 0: gap. */
 static void remember(const orthocas_arm *arm, orthocas_state *state, const orthocas_reference *reference,
                      const orthocas_gains *gains, double active, double period, double *work) {
   double *last = take(&work, arm->memory);
@@ -1171,8 +1184,7 @@ static void remember(const orthocas_arm *arm, orthocas_state *state, const ortho
 /* ---- begin, resume, brakes ---- */
 
 /* R31: before anything moves, the torque that holds the arm at rest is the model's, within start_mismatch; else the
- * mounting or the tool is another one. The fallback at the gains holds the arm; that of velocity laws is none, so
- * gravity counts. */
+ * mounting or the tool is another one. The fallback at the gains holds the arm; of velocity laws, gravity counts. */
 ORTHOCAS_API int orthocas_check_start(const orthocas_arm *arm, const orthocas_safety *safety, const double *q,
                                       const double *torque, const void *gains, double *mismatch, double *work) {
   const int n = arm->n;
@@ -1200,10 +1212,10 @@ ORTHOCAS_API void orthocas_resume(orthocas_state *state) {
 ORTHOCAS_API void orthocas_stand(const orthocas_arm *arm, orthocas_state *state, int mode, const double *q,
                                  const double *command) {
   double *forgotten[] = {state->dq,          state->impulse,  state->expected, state->momentum,
-                         state->unexplained, state->load,     state->touch};
+                         state->unexplained, state->load,     state->touch, state->carried};
   const int n = arm->n, seen = is_position(arm, q);
   for (int i = 0; i < n && seen; ++i) state->q[i] = unturned(arm, state, i, q[i]);
-  for (int i = 0; i < (arm->torque ? 7 : 2); ++i) set_zero(forgotten[i], n);
+  for (int i = 0; i < (arm->torque ? 8 : 2); ++i) set_zero(forgotten[i], n);
   state->energy = 0.0;
   if (arm->memory > 0) copy(state->memory, arm->memory_start, arm->memory);
   copy(state->anchor, state->q, n);
@@ -1215,8 +1227,7 @@ ORTHOCAS_API void orthocas_stand(const orthocas_arm *arm, orthocas_state *state,
   state->brake = 1.0;
 }
 
-/* R25: begin anywhere under the catcher, or under the law from another controller, with the command that the robot
- * executes now, so nothing jumps. */
+/* R25: begin anywhere under the catcher, or the law, with the command that the robot executes now, so nothing jumps. */
 ORTHOCAS_API void orthocas_begin(const orthocas_arm *arm, orthocas_state *state, int mode, const double *q,
                                  const double *command, double *work) {
   const int seen = is_position(arm, q), told = command != 0 && all_finite(arm, command, arm->n);
@@ -1260,14 +1271,14 @@ static void brake_unseen(const orthocas_arm *arm, orthocas_state *state, int fir
   for (int i = 0; i < n; ++i) state->momentum[i] = (command[i] - held[i]) * period;
 }
 
-/* R27: without a measurement, the command is held for hold_ticks; then the catcher is to stop the arm. */
+/* R27: without a measurement, commands are held, or taken back to the last seen; after hold_ticks, the catcher stops. */
 static void tick_without_measurement(const orthocas_arm *arm, orthocas_state *state, const orthocas_gains *gains,
-                                     double period, double *command, double *work) {
+                                     int still, double period, double *command, double *work) {
   const int hold = state->safety->hold_ticks, lost = state->bad_ticks >= hold;
   const int first = state->bad_ticks < hold + later(0, period);
   double *fallback = take(&work, arm->n);
   fallback_at(arm, state->q, gains->used, fallback);
-  copy(command, lost ? fallback : state->command, arm->n);
+  copy(command, lost ? fallback : still ? state->impulse_from : state->command, arm->n);
   if (lost && (state->mode == ORTHOCAS_LAW || state->mode == ORTHOCAS_RETURN))
     catch_arm(arm, state, ORTHOCAS_BAD_INPUT);
   if (lost) state->weight = 0.0;
@@ -1279,8 +1290,7 @@ static void tick_without_measurement(const orthocas_arm *arm, orthocas_state *st
   copy(state->command, command, arm->n);
 }
 
-/* At the first good measurement: where the catcher holds the arm, where it would bring it, and whether the law may take
- * over. */
+/* At the first good measurement: where the catcher holds the arm, or brings it, and whether the law may take over. */
 static void settle(const orthocas_arm *arm, orthocas_state *state, double room, double *work) {
   const double margin = state->safety->return_margin, *q = state->q;
   well_inside(arm, q, 1.0 - margin - rules.room, state->safe, work);
@@ -1302,26 +1312,25 @@ ORTHOCAS_API int orthocas_step(const orthocas_arm *arm, orthocas_state *state, i
   double *speed = take(&work, n), *M = take(&work, n * n), *bias = take(&work, n), *gravity = take(&work, n);
   double clear, room, gap;
   const orthocas_reference shifted = take_places(arm, &work);
-  int good, cut, lost, known, status, limited = 1;
-
+  int seen, good, cut, lost, known, status, limited = 1;
   /* A limit that is not > 0 is not used; the last one holds (R5). */
   for (int i = 0; i < n; ++i) limited = limited && gains->given_limit[i] > 0.0;
   for (int i = 0; i < k; ++i) set = set && safety->integral_rate[i] <= arm->integral_bound; /* R17 */
   if (limited) copy(state->limit, gains->given_limit, n);
   copy(gains->limit, state->limit, n);
-
   /* The measurement, without whole turns and, with an observer, without noise. */
   state->unseen += since;
   if (arm->torque) foresee(arm, state, since);
-  if (!timed || !look(arm, state, q, dq, period, work)) {
-    tick_without_measurement(arm, state, gains, since, command, work);
+  seen = timed ? look(arm, state, q, dq, period, work) : 0;
+  if (seen <= 0) {
+    tick_without_measurement(arm, state, gains, seen < 0, since, command, work);
     return ORTHOCAS_BAD_INPUT;
   }
   for (int i = 0; i < n; ++i) here[i] = unturned(arm, state, i, q[i]);
   copy(speed, dq, n);
   if (arm->torque) observe(arm, state, here, speed, since);
   lost = state->bad_ticks >= safety->hold_ticks && state->bad_ticks > later(0, since); /* not after one slow tick */
-  gap = since * (1.0 + (double)state->bad_ticks / (double)later(0, since)); /* with ticks that kept the command */
+  gap = lasted(state->bad_ticks, since); /* with ticks that kept the command */
   if (state->fresh || lost || late || state->mode == ORTHOCAS_HOLD) gap = 0.0;
   known = gap > 0.0 && state->bad_ticks == 0;
   state->bad_ticks = 0;
@@ -1336,7 +1345,6 @@ ORTHOCAS_API int orthocas_step(const orthocas_arm *arm, orthocas_state *state, i
   clear = clearance(arm, here, work);
   room = distance(arm, here, speed, 0.0, clear, work);
   arm->kernels.shared(here, speed, shared);
-
   /* The reference, and with it the law. */
   good = take_reference(arm, state, shared, reference, since, measured, error, change, work);
   govern(arm, state, shared, measured, error, change, since, &shifted, work);
@@ -1345,7 +1353,6 @@ ORTHOCAS_API int orthocas_step(const orthocas_arm *arm, orthocas_state *state, i
   if (state->fresh) settle(arm, state, room, work);
   status = arm->kernels.control(shared, here, speed, &shifted, gains->used, law);
   fallback_at(arm, here, gains->used, fallback);
-  /* Who commands, and the command. */
   choose_mode(arm, state, status, clear, room, error, since, late, work);
   for (int i = 0; i < n; ++i) { /* one that gives way gets what it had, but nothing that drives its joint on */
     if (gives_way(state) && before == ORTHOCAS_LAW) state->law[i] = state->command[i] - fallback[i];
@@ -1358,13 +1365,10 @@ ORTHOCAS_API int orthocas_step(const orthocas_arm *arm, orthocas_state *state, i
   else compose_velocity(arm, state, fallback, command);
   cut = cut_command(arm, state, since, command) || status == ORTHOCAS_SATURATED;
   copy(state->command, command, n);
-
-  /* What the next tick has to know. */
   watch_sensors(arm, state, fallback, command, since);
   if (arm->torque) expect(arm, state, command, fallback, M, bias, gravity, work);
   advance(arm, state, shared, error, cut, clear, room, since, work);
   if (arm->memory > 0) remember(arm, state, &shifted, gains, cut ? 0.0 : state->weight, known ? since : 0.0, work);
-
   /* R28: the status says what the program should do. */
   if (state->mode == ORTHOCAS_CATCHER || state->mode == ORTHOCAS_HOLD) return ORTHOCAS_CAUGHT;
   if (state->mode == ORTHOCAS_RETURN) return ORTHOCAS_RETURNING;
@@ -1379,8 +1383,7 @@ ORTHOCAS_API void orthocas_reference_at(const orthocas_arm *arm, const double *q
                                         double *work) {
   double *shared = take(&work, arm->shared), *measured = take(&work, arm->k), *error = take(&work, arm->k);
   double *still = take(&work, arm->n);
-  set_zero(reference->value, arm->k);
-  set_zero(reference->velocity, 2 * arm->k);
+  set_zero(reference->value, 3 * arm->k);
   if (!all_finite(arm, q, arm->n)) return;
   set_zero(still, arm->n);
   arm->kernels.shared(q, still, shared);
@@ -1400,8 +1403,7 @@ static double share_inside(const orthocas_arm *arm, const orthocas_safety *safet
 }
 
 /* How much of the way to a target a stream may see: as much as is inside the boundary, which may cut it, and at which
- * three equal poles keep within the limits: their speed is at most omega / 3 times what they see, their acceleration
- * omega^2 / 2. */
+ * three equal poles keep within the limits: speeds of omega / 3 times what they see, accelerations of omega^2 / 2. */
 static double share_of_way(const orthocas_arm *arm, const double *q, const double *dq, const orthocas_safety *safety,
                            const orthocas_reference *reference, const double *way, double omega, int *cut,
                            double *work) {

@@ -161,7 +161,7 @@ typedef struct {
   double weight, brake, unseen, hasty, energy;
   double *q, *dq, *seen_q, *seen_dq, *command, *led, *impulse, *impulse_from, *law, *anchor, *safe, *limit; /* (n,) */
   double *offset, *integral;                                                                                /* (k,) */
-  double *load, *drive, *speed, *expected, *unexplained, *momentum, *trend, *touch; /* (n,), null for velocity laws */
+  double *load, *drive, *speed, *expected, *unexplained, *momentum, *trend, *touch, *carried; /* (n,), null for velocity laws */
   double *inertia;                                                           /* (n, n), null for velocity laws */
   double *memory;                                                            /* (memory,) or null */
   orthocas_reference reference;
