@@ -166,8 +166,8 @@ class Continuation:
             self._require_memory(target)
             steps = [target.of_degree(degree) for degree in range(min(target.degree, 2), target.degree + 1)]
         last, before = steps[-1], -np.inf
-        # of the rounds without a fold the best one: its conditioning, number of stages up to it, and worst points
-        best: tuple[float, int, WorstPoints | None] = (0.0, 0, None)
+        # the best round: its conditioning, number of stages up to it, and worst points
+        best: tuple[float, int, WorstPoints | None] = (-np.inf, 0, None)
         try:
             for step in steps:
                 self._solve(step, step.label, final=step is last)
@@ -182,10 +182,10 @@ class Continuation:
                 before = folds.least
                 self._solve(last, f"{last.label}, round {k}", final=True)
             # new points may bring back folds that an earlier round had left behind
-            if folds.least < 0 and best[2] is not None:
+            if folds.least < min(best[0], 0):
                 self._stages, folds.worst = self._stages[: best[1]], best[2]
             # the domain forces folds: their term would only spoil the rest
-            if folds.least < 0:
+            if folds.least < 0 and folds.singular:
                 folds.give_up()
                 self._solve(last, f"{last.label}, with folds", final=True)
         except KeyboardInterrupt:  # also between minimisations
