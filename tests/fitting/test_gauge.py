@@ -4,7 +4,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from programs import nightly
 
 import orthocas as oc
 from orthocas.bases import JointSpace
@@ -23,9 +22,7 @@ def parallel(a: oc.Chart, b: oc.Chart) -> Array:
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "degree", "least"), [("planar_x", 4, 0.99), ("planar_xy", 3, 0.99), *nightly(("iiwa", 3, 0.97))]
-)
+@pytest.mark.parametrize(("name", "degree", "least"), [("planar_x", 4, 0.99), ("planar_xy", 3, 0.99)])
 def test_seeds_lead_to_the_same_coordinates_in_the_same_order_and_sign(
     request: pytest.FixtureRequest, name: str, degree: int, least: float
 ) -> None:
@@ -33,6 +30,14 @@ def test_seeds_lead_to_the_same_coordinates_in_the_same_order_and_sign(
     first, *others = (oc.fit(problem, oc.Polynomial(degree), seed=seed).chart for seed in range(3))
     for other in others:
         assert np.diag(parallel(first, other)).min() > least
+
+
+@pytest.mark.nightly
+def test_seeds_lead_to_the_same_coordinates_of_the_iiwa(iiwa: oc.Problem) -> None:
+    """Two of them have the same mean at the centre but for rounding, so their order may differ between seeds."""
+    first, *others = (oc.fit(iiwa, oc.Polynomial(3), seed=seed).chart for seed in range(3))
+    for other in others:
+        assert np.abs(parallel(first, other)).max(axis=1).min() > 0.97
 
 
 def test_order_and_sign_follow_the_gradients_at_the_centre(iiwa_fit: Fit, iiwa: oc.Problem) -> None:

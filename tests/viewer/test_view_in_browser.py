@@ -103,9 +103,14 @@ def test_a_slider_moves_the_joints_and_the_flange_stays(page: Page, iiwa_fit: Fi
         before = joints(page, chart)
         start = float(before[1])
         np.testing.assert_allclose(before, chart.problem.domain.centre, atol=1e-12)
+        # the range of x, which at the end of the coordinate is another one
+        highest = f"+{SLIDERS}[4].querySelector('[role=slider]').getAttribute('aria-valuemax')"
+        at_first = page.value(highest)
         to_the_end(page, 0)
         page.wait(f"Math.abs(({NUMBERS})['A2'] - {start!r}) > 0.02")
         page.wait(f"({button('Undo')}).disabled === false")
+        page.wait(f"Math.abs({highest} - {at_first!r}) > 1e-9")
+        at_end = page.value(highest)
         after, shown = joints(page, chart), page.value(NUMBERS)
         assert np.abs(after - before).max() > 0.05
         assert shown["drift"] <= 1e-6
@@ -113,6 +118,7 @@ def test_a_slider_moves_the_joints_and_the_flange_stays(page: Page, iiwa_fit: Fi
         assert drawn(page, tmp_path / "chart.png")
         page.click(button("Home"))
         page.wait(f"Math.abs(({NUMBERS})['A2'] - {start!r}) < 1e-9")
+        page.wait(f"{highest} != {at_end!r}")
         to_the_end(page, 4)  # the task: now the flange moves
         page.wait(f"Math.abs(({NUMBERS})['A2'] - {start!r}) > 1e-3")
         moved = joints(page, chart)
