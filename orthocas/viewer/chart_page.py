@@ -46,7 +46,6 @@ class ChartPage:
         self._gesture = self._dragging = self._sweeping = False
         self._path: Array | None = None  # waypoints to play
         self._line: Any = None  # that shows them
-        self._told: dict[str, float] = {}  # values of sliders that the page set last
         self._recorded: list[tuple[float, Array]] | None = None  # times [s] and joints (n,), while it records
         # The scene, with room for all that the coordinates reach, then what the user moves, then what it shows first.
         robot = session.chart.problem.robot
@@ -98,10 +97,9 @@ class ChartPage:
         what = label or name
 
         async def moved(event: Any) -> None:
-            # Otherwise the page itself moved it; a browser sends back what it was told where a range has changed.
-            value = float(event.target.value)
-            if event.client is not None and value != self._told.get(what):
-                self._told.pop(what, None)
+            # Otherwise the page itself moved it.
+            if event.client is not None:
+                value = float(event.target.value)
                 self._loop.ask(what, lambda: self._move_towards({what: value}))
 
         slider.on_update(moved)
@@ -351,7 +349,7 @@ class ChartPage:
             for label, value in zip(self._chart.labels, values, strict=True):
                 slider = self._sliders[label]
                 if label not in moved and np.isfinite(value):
-                    slider.value = self._told[label] = min(max(round(value, 3), slider.min), slider.max)
+                    slider.value = min(max(round(value, 3), slider.min), slider.max)
             self._undo.disabled = not self.session.can_undo
 
     def _show_arm(self, q: Array) -> None:
