@@ -34,7 +34,7 @@ def test_seeds_lead_to_the_same_coordinates_in_the_same_order_and_sign(
 
 @pytest.mark.nightly
 def test_seeds_lead_to_the_same_coordinates_of_the_iiwa(iiwa: oc.Problem) -> None:
-    """Two of them have the same mean at the centre but for rounding, so their order may differ between seeds."""
+    """In any order: at the centre, the mean joints by which they are sorted differ by 0.001 to 0.06 only."""
     first, *others = (oc.fit(iiwa, oc.Polynomial(3), seed=seed).chart for seed in range(3))
     for other in others:
         assert np.abs(parallel(first, other)).max(axis=1).min() > 0.97
