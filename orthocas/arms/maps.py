@@ -32,6 +32,8 @@ class MapRules:
     stored: int = 20_000  #: postures from which searches start
     seed: int = 0  #: of them
     least_volume: float = 1e-12  #: det(J J^T) of postures that count as singular
+    shifted: int = 16  #: postures at which a rail shifts x alike
+    same: float = 1e-9  #: of such shifts [m], by a metre of the rail
     no_rotation: float = 1e-8  #: sum of squares above that of rotations: vectors longer than half a turn by 1e-9
 
 
@@ -85,12 +87,24 @@ class ArmMaps:
 
     @cached_property
     def place_sizes(self) -> Array:
-        """A target divided by these is a place: distances of places are errors of x, as of `equations`, (k,)."""
-        if not self.turned:
-            return self.scale
-        # |R - S| / sqrt(2) is the angle between both, for small ones.
-        position = self.scale[:3] if self.task.turn is not None and self.task.turn.with_position else np.zeros(0)
-        return np.concatenate([position, np.full(9, np.sqrt(2))])
+        """A target divided by these is a place: distances of places are errors of x, as of `equations`, (k,).
+
+        They are infinite for what a rail without limits makes up for, wherever the arm stands.
+        """
+        sizes = self.scale
+        if self.turned:
+            # |R - S| / sqrt(2) is the angle between both, for small ones.
+            position = self.scale[:3] if self.task.turn is not None and self.task.turn.with_position else np.zeros(0)
+            sizes = np.concatenate([position, np.full(9, np.sqrt(2))])
+        # A rail moves one component of the target, and at all postures alike.
+        whole, sizes = find_joint_range(self.robot, 0), sizes.copy()
+        q = sample_evenly(Box(whole.centre, whole.half_width), RULES.shifted, 0)
+        for k in np.flatnonzero(~self.turning & np.isinf(self.robot.lower) & np.isinf(self.robot.upper)):
+            shifts = self.targets_of(q + np.eye(self.robot.n)[k]) - self.targets_of(q)
+            moved = np.flatnonzero(np.abs(shifts).max(axis=0) > RULES.same)
+            if moved.size == 1 and np.ptp(shifts[:, moved]) < RULES.same:
+                sizes[moved] = np.inf
+        return sizes
 
     @cached_property
     def kernel(self) -> CurveKernel:

@@ -136,9 +136,11 @@ def find_joint_range(robot: Robot, margin_deg: float) -> Box:
     low, high = np.where(endless, turn - np.pi, low), np.where(endless, turn + np.pi, high)
     empty = np.flatnonzero(low >= high)
     if empty.size:
-        name = robot.joint_names[int(empty[0])]
+        k = int(empty[0])
+        name, limits = robot.joint_names[k], f"[{robot.lower[k]:.4g}, {robot.upper[k]:.4g}]"
+        wanted = "a smaller one" if margin > 0 else "limits with room between them, or a locked joint"
         raise DomainError(
-            f"joint '{name}' has no range left with a margin of {margin_deg:g} deg, expected a smaller one"
+            f"joint '{name}' has no range left within {limits} with a margin of {margin_deg:g} deg, expected {wanted}"
         )
     free = endless & np.isinf(robot.lower) & np.isinf(robot.upper)
     return Box((low + high) / 2, (high - low) / 2, np.flatnonzero(free).tolist())

@@ -9,6 +9,7 @@ from functools import cache
 import numpy as np
 import pinocchio as pin
 import pytest
+from conftest import ROBOTS, robot_data
 from conftest import arm as read_arm
 from programs import needs_c, nightly
 from random_arms import random_arm
@@ -180,6 +181,42 @@ def test_points_on_an_arc_are_as_far_apart_as_their_places() -> None:
     arc = panda().self_motion(panda().x(postures(panda(), 1, 4)[0])).components[0]
     q = arc.at(np.linspace(0.0, arc.length, 20_001))
     assert np.linalg.norm(np.diff(q, axis=0), axis=1).sum() == pytest.approx(arc.length, rel=1e-4)
+
+
+def test_short_arcs_and_those_with_bends_have_the_length_of_dense_samples() -> None:
+    lower, upper, rng = panda().robot.lower, panda().robot.upper, np.random.default_rng(5)
+    for k in range(109):
+        # Every other elbow is at its limit, nearly stretched, where limits cut curves to pieces of 0.005 rad.
+        q = rng.uniform(lower, upper)
+        if k % 2:
+            q[3] = min(0.02 * rng.standard_normal(), upper[3])
+        if k not in (1, 39, 108):
+            continue
+        arcs = panda().self_motion(panda().x(q)).components
+        assert min(arc.length for arc in arcs) < 1.3
+        for arc in arcs:
+            dense = arc.at(np.linspace(0.0, arc.length, 2001))
+            assert arc.length == pytest.approx(np.linalg.norm(np.diff(dense, axis=0), axis=1).sum(), rel=5e-4)
+
+
+@pytest.mark.slow
+def test_a_rail_without_limits_takes_the_arm_to_far_targets() -> None:
+    file, tip = ROBOTS["ur5"]
+    arm = oc.Arm(oc.Task.pose(oc.Robot.from_urdf(robot_data(file), tip, base="rail:x")))
+    near = postures(arm, 3, 0)
+    for q in near:
+        counts = []
+        for rail in (0.0, 10.0, 30.0, 1000.0):
+            there = q + rail * np.eye(arm.robot.n)[0]
+            x = arm.x(there)
+            motions = arm.self_motion(x)
+            # The posture itself is among them, and all are shifted.
+            assert motions.nearest(there).value < 1e-6
+            counts.append(len(motions))
+            solved = arm.solve(x)
+            assert solved.found
+            assert np.allclose(arm.x(solved.q), x, rtol=0, atol=1e-8)
+        assert len(set(counts)) == 1
 
 
 def test_samples_have_equal_distances_in_their_metric() -> None:

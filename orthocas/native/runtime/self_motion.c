@@ -57,11 +57,15 @@ static int tangent_at(const double *J, double *t) {
   return 0;
 }
 
-/* Damped least squares from q to x, whatever the limits; 1 if it arrives, with the tangent there. */
+/* Whether a joint slides without limits: x may be any distance from the stored postures along it. */
+static int is_rail(int joint) { return !turning[joint] && !isfinite(high[joint] - low[joint]); }
+
+/* Damped least squares from q to x, whatever the limits; 1 if it arrives, with the tangent there. Steps are bounded,
+ * other than those of rails. */
 static int reach(double *q, const double *target, double *t) {
   int round, i, j, k;
   for (round = 0; round < REACH; ++round) {
-    double e[M], J[M * N], L[M][M], inverse[M], y[M], step[N], trace = 0.0, damping, size;
+    double e[M], J[M * N], L[M][M], inverse[M], y[M], step[N], trace = 0.0, bounded = 0.0, damping, size;
     const double error = task_at(q, target, e, J);
     if (!isfinite(error)) return 0;
     for (i = 0; i < M; ++i) {
@@ -96,7 +100,9 @@ static int reach(double *q, const double *target, double *t) {
       for (i = 0; i < M; ++i) step[k] += J[i + M * k] * y[i];
     }
     size = sqrt(dot(step, step));
-    for (k = 0; k < N; ++k) q[k] += fmin(1.0, LARGEST / (size + 1e-300)) * step[k];
+    for (k = 0; k < N; ++k) bounded += is_rail(k) ? 0.0 : step[k] * step[k];
+    bounded = fmin(1.0, LARGEST / (sqrt(bounded) + 1e-300));
+    for (k = 0; k < N; ++k) q[k] += (is_rail(k) ? 1.0 : bounded) * step[k];
     if (error <= REACHED && size < ARRIVED) return tangent_at(J, t);
   }
   return 0;
@@ -220,16 +226,22 @@ static int follow(node *nodes, int most, const double *target, double sense, int
       if (h < SHORTEST) break;
       continue;
     }
-    nodes[count - 1].length = h_before = length_of(at, next);
-    ++count;
-    if (count > 3 && on_step(nodes + count - 2, nodes + count - 1, nodes[0].q, nodes[0].t, target)) {
+    nodes[count - 1].length = length_of(at, next);
+    if (count > 2 && on_step(at, next, nodes[0].q, nodes[0].t, target)) {
+      if (h > SHORTEST * 2 && !(dot(at->t, nodes[0].t) > TURNED)) { /* the first point lies in a bend */
+        h /= 2;
+        continue;
+      }
       for (i = 0; i < N; ++i) /* the last node is the first */
         next->q[i] = nodes[0].q[i] + (turning[i] ? TURN * rint((next->q[i] - nodes[0].q[i]) / TURN) : 0.0);
       memcpy(next->t, nodes[0].t, sizeof next->t);
-      nodes[count - 2].length = length_of(nodes + count - 2, next);
+      nodes[count - 1].length = length_of(at, next);
+      ++count;
       *closed = 1;
       break;
     }
+    h_before = nodes[count - 1].length;
+    ++count;
     if (!goes_on(next->q)) break;
     h *= fmin(1.6, fmax(0.5, cbrt(fmin(AIM, TIGHT * h) / fmax(missed, 1e-9))));
     h = fmin(h, STEP);
@@ -451,7 +463,8 @@ static double find_graze(const node *a, const node *b, double graze) {
 
 /* Add where a joint, on a piece of a step, has a value v beyond its value at the begin. */
 static void cross(search *s, const node *a, const node *b, const cubic *c, const double *piece, double v, crossing kind) {
-  double left = piece[0], right = piece[1], t[N];
+  double left = piece[0], right = piece[1], t[N], before, whole;
+  node exact;
   const int above = value_of(c, left) - v > 0.0;
   crossing *at = s->found + s->count;
   int round;
@@ -467,7 +480,11 @@ static void cross(search *s, const node *a, const node *b, const cubic *c, const
     point_on(a, b, left, at->q, t);
     meet_curve(s->target, at->q, t);
   }
-  at->place += left * a->length;
+  memcpy(exact.q, at->q, sizeof exact.q);
+  memcpy(exact.t, t, sizeof exact.t);
+  before = length_of(a, &exact);
+  whole = before + length_of(&exact, b);
+  at->place += a->length * (whole > 0.0 ? before / whole : left);
   at->rises = !above;
   ++s->count;
 }
