@@ -353,6 +353,19 @@ def test_gap_and_merge_of_a_planar_arm_are_those_of_its_linkage() -> None:
         motions.merge(0, 5)
 
 
+def test_the_error_of_a_merge_is_that_of_all_of_its_way() -> None:
+    """Of these arcs, any way turns the hand by pi in between; at 31 postures of it the error was 2.7 at most."""
+    arm = oc.Arm(oc.load("xarm7-wide").task)
+    pose = arm.robot.pose(arm.robot.sample(1, seed=1)[0])
+    merge = arm.self_motion(pose).merge(1, 2)
+    whole = np.vstack([np.linspace(a, b, 50) for a, b in zip(merge.way, merge.way[1:], strict=False)])
+    turned = np.einsum("kij,ij->k", arm.robot.pose(whole)[:, :3, :3], pose[:3, :3])
+    angles = np.arccos(np.clip((turned - 1) / 2, -1, 1))
+    assert angles.max() > 3.1
+    assert merge.value >= angles.max() - 1e-3
+    assert np.linalg.norm(np.diff(merge.way, axis=0), axis=1).max() < 0.15
+
+
 @needs_c
 @pytest.mark.parametrize("which", [panda, planar])
 def test_solve_gives_the_best_posture_of_all_arcs(which: Callable[[], oc.Arm]) -> None:
