@@ -325,7 +325,7 @@ def write_tracker(
         "low": robot.lower,
         "high": robot.upper,
         "slides": ~maps.turning,
-        "rails": ~maps.turning & np.isinf(robot.lower) & np.isinf(robot.upper),
+        "endless": np.isinf(robot.lower) & np.isinf(robot.upper),
         "turned": maps.turned,
         "include": f'#include "{name}_track.h"',
     }

@@ -96,7 +96,7 @@ class Gap(NamedTuple):
 class Merge(NamedTuple):
     """A way from one component to another, which leaves x as little as was found."""
 
-    value: float  #: largest error of x on the way, straight from posture to posture [rad], or as far as a radian moves x
+    value: float  #: largest error of x on the way, straight between postures [rad], or as far as a radian moves x
     q: Array  #: the posture there (n,); with its value of x, the two components meet, or a limit is in the way
     x: Array  #: that value of x (m,)
     way: Array  #: postures (P, n) from one component to the other
@@ -134,7 +134,9 @@ class Arc(Shown):
             place: lengths [rad] or [m].
         """
         s = as_float_array("place", place)
-        places = np.clip(np.nan_to_num(s.reshape(-1)), 0.0, self.length)
+        if np.isnan(s).any():
+            raise InvalidValueError("place", "NaN", "lengths along the arc")
+        places = np.clip(s.reshape(-1), 0.0, self.length)
         q = self._stand(places)[0]
         return np.asarray(q.reshape(*s.shape, q.shape[1]))
 
@@ -280,7 +282,7 @@ class SelfMotions(Shown):
             f: joint positions (N, n) -> values (N,), or "manipulability", `Task.manipulability` of the task.
 
         Raises:
-            InvalidValueError: if there are no components, or f returns something else.
+            InvalidValueError: if there are no components, or f returns something else, or a number nowhere.
         """
         self._require_components()
 
@@ -299,6 +301,8 @@ class SelfMotions(Shown):
         places = [np.linspace(0.0, arc.length, count) for arc, count in zip(self.components, counts, strict=True)]
         q = np.vstack([arc.at(part) for arc, part in zip(self.components, places, strict=True)])
         values = evaluate(q)
+        if values.max() == -np.inf:
+            raise InvalidValueError("what f returns", "NaN or -infinity at all postures", "a number at some of them")
         row, owners = int(np.argmax(values)), np.repeat(np.arange(len(counts)), counts)
         k = int(owners[row])
         arc, at, step = self.components[k], float(np.concatenate(places)[row]), self.components[k].length / counts[k]

@@ -260,6 +260,10 @@ def test_best_posture_is_better_than_dense_samples() -> None:
     assert found.value >= np.sqrt(np.linalg.det(J @ J.transpose(0, 2, 1))).max() - 1e-9
     with pytest.raises(UnknownNameError, match="known: manipulability"):
         motions.best("dexterity")
+    with pytest.raises(InvalidValueError, match="a number at some of them"):
+        motions.best(lambda q: np.full(len(q), np.nan))
+    with pytest.raises(InvalidValueError, match="lengths along the arc"):
+        motions.components[0].at(np.nan)
     with pytest.raises(InvalidValueError, match="what f returns"):
         motions.best(lambda q: q)
 
