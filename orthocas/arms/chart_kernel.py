@@ -325,6 +325,8 @@ def write_tracker(
         "low": robot.lower,
         "high": robot.upper,
         "slides": ~maps.turning,
+        "endless": np.isinf(robot.lower) & np.isinf(robot.upper),
+        "turned": maps.turned,
         "include": f'#include "{name}_track.h"',
     }
     # The exported tracker brings its own postures; the library in Python shares them between trackers.

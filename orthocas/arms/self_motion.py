@@ -51,7 +51,9 @@ RULES = ArcRules()
 class MergeRules:
     """Numbers of the search for the way on which two components join."""
 
-    images: int = 31  #: postures of the way
+    images: int = 31  #: postures of the way, at least
+    spacing: float = 0.1  #: between them, at most [rad] or [m]
+    parts: int = 16  #: of the way from each to the next, at which errors are measured
     rounds: int = 400  #: of the search, at most
     step: float = 0.3  #: of a Gauss-Newton step towards x that a posture goes, across the way
     longest: float = 0.05  #: of the steps
@@ -94,7 +96,7 @@ class Gap(NamedTuple):
 class Merge(NamedTuple):
     """A way from one component to another, which leaves x as little as was found."""
 
-    value: float  #: largest error of x on the way [rad], or as long as a radian moves the tip
+    value: float  #: largest error of x on the way, straight between postures [rad], or as far as a radian moves x
     q: Array  #: the posture there (n,); with its value of x, the two components meet, or a limit is in the way
     x: Array  #: that value of x (m,)
     way: Array  #: postures (P, n) from one component to the other
@@ -132,7 +134,9 @@ class Arc(Shown):
             place: lengths [rad] or [m].
         """
         s = as_float_array("place", place)
-        places = np.clip(np.nan_to_num(s.reshape(-1)), 0.0, self.length)
+        if np.isnan(s).any():
+            raise InvalidValueError("place", "NaN", "lengths along the arc")
+        places = np.clip(s.reshape(-1), 0.0, self.length)
         q = self._stand(places)[0]
         return np.asarray(q.reshape(*s.shape, q.shape[1]))
 
@@ -278,7 +282,7 @@ class SelfMotions(Shown):
             f: joint positions (N, n) -> values (N,), or "manipulability", `Task.manipulability` of the task.
 
         Raises:
-            InvalidValueError: if there are no components, or f returns something else.
+            InvalidValueError: if there are no components, or f returns something else, or a number nowhere.
         """
         self._require_components()
 
@@ -297,6 +301,8 @@ class SelfMotions(Shown):
         places = [np.linspace(0.0, arc.length, count) for arc, count in zip(self.components, counts, strict=True)]
         q = np.vstack([arc.at(part) for arc, part in zip(self.components, places, strict=True)])
         values = evaluate(q)
+        if values.max() == -np.inf:
+            raise InvalidValueError("what f returns", "NaN or -infinity at all postures", "a number at some of them")
         row, owners = int(np.argmax(values)), np.repeat(np.arange(len(counts)), counts)
         k = int(owners[row])
         arc, at, step = self.components[k], float(np.concatenate(places)[row]), self.components[k].length / counts[k]
@@ -354,7 +360,8 @@ class SelfMotions(Shown):
         """A way from one component to another on which x deviates little.
 
         From the straight way across their gap, postures go down to smaller errors of x, across the way, which is kept
-        at equal distances. It is one way, not the best of all: its error is an upper bound of the least.
+        at equal distances. It is one way, not the best of all: the least error of any way is that of this one, or less.
+        Straight ways between neighbouring postures count, at 16 places of each.
 
         Args:
             a: number of a component.
@@ -369,12 +376,10 @@ class SelfMotions(Shown):
         gap = self.gap(a, b)
         # The straight way across the gap, in even images.
         end = gap.first.q + self.measure_away(gap.second.q[None], gap.first.q)[0]
-        shares = np.linspace(0.0, 1.0, MERGE.images)[:, None]
-        q, before = gap.first.q + shares * (end - gap.first.q), np.inf
-        targets = np.tile(self.target, (MERGE.images, 1))
+        q, before = np.linspace(gap.first.q, end, MERGE.images), np.inf
         low, high = self.maps.robot.lower, self.maps.robot.upper
         for _ in range(MERGE.rounds):
-            e, J = self.maps.evaluate(q, targets)
+            e, J = self.maps.evaluate(q, np.tile(self.target, (len(q), 1)))
             most = float(np.linalg.norm(e, axis=1).max())
             if abs(before - most) < MERGE.settled * most:
                 break
@@ -390,17 +395,25 @@ class SelfMotions(Shown):
                 MERGE.step, MERGE.longest / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-300)
             )
             q[1:-1] = np.clip(q + step, low, high)[1:-1]
-            # Images stay at equal distances.
+            # Images stay at equal distances, and become more as the way gets longer.
             lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(q, axis=0), axis=1))])
-            even = np.linspace(0.0, lengths[-1], MERGE.images)
+            even = np.linspace(0.0, lengths[-1], max(MERGE.images, int(lengths[-1] / MERGE.spacing) + 2))
             q = np.column_stack([np.interp(even, lengths, column) for column in q.T])
         # The largest error is that of a pass between both sides, which Newton's method finds exactly.
-        errors = np.linalg.norm(self.maps.evaluate(q, targets)[0], axis=1)
+        errors = self._measure_errors(q)
         k = int(np.argmax(errors))
         q[k] = self._find_pass(q[k], float(errors[k]))
-        errors[k] = np.linalg.norm(self.maps.evaluate(q[k : k + 1], targets[:1])[0])
-        vector = self.maps.targets.vector(self.maps.targets_of(q[k : k + 1]))[0]
-        return Merge(float(errors[k]), q[k], np.asarray(vector), q)
+        # The way from image to image counts, too.
+        shares = np.arange(MERGE.parts)[:, None, None] / MERGE.parts
+        whole = np.vstack([(q[:-1] + shares * np.diff(q, axis=0)).reshape(-1, q.shape[1]), q[-1:]])
+        errors = self._measure_errors(whole)
+        worst = whole[[int(np.argmax(errors))]]
+        vector = self.maps.targets.vector(self.maps.targets_of(worst))[0]
+        return Merge(float(errors.max()), worst[0], np.asarray(vector), q)
+
+    def _measure_errors(self, q: Array) -> Array:
+        """|e| of postures (N, n), (N,)."""
+        return np.asarray(np.linalg.norm(self.maps.evaluate(q, np.tile(self.target, (len(q), 1)))[0], axis=1))
 
     def _find_pass(self, q: Array, error: float) -> Array:
         """The posture near q (n,) within the limits at which |e|^2 neither rises nor falls; q where there is none."""

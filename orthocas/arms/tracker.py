@@ -24,7 +24,7 @@ class TrackStatus(IntEnum):
     YIELDING = 1  #: x is met; xi is another one: a limit, a border of the chart or the speed of joints is in its way
     BEHIND = 2  #: x is not met: the arm moves towards it as fast as its joints may, or goes another way to it
     NEAREST = 3  #: x is out of reach from here: a local minimum of its error within the limits, at rest
-    BAD_INPUT = 4  #: a number of x or xi is not finite; the arm stays
+    BAD_INPUT = 4  #: a number of x or xi is not finite, or x no orientation (beyond half a turn); the arm stays
     BRAKED = 5  #: a part of the way, or none: all of it would come nearer to a contact than `margin` allows
 
 

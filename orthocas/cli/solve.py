@@ -101,9 +101,11 @@ def _print(rows: list[tuple[Array, Array, Any, str]], json: bool) -> None:
         typer.echo("no posture")
     for k, (q, xi, status, branch) in enumerate(() if json else rows):
         label = f" {k + 1}" if len(rows) > 1 else ""
-        xi_text = _write(xi) if np.isfinite(xi).all() else "none"
-        named = {f"branch{label}": branch} if branch else {}
-        texts = {f"q{label}": _write(q), f"xi{label}": xi_text, **named}
+        # What misses x is no posture that anybody asked for.
+        missed = status in (InverseStatus.NOT_FOUND, InverseStatus.BAD_INPUT, InverseStatus.OUT_OF_REACH)
+        xi_text = _write(xi) if np.isfinite(xi).all() and not missed else "none"
+        named = {f"branch{label}": branch} if branch and not missed else {}
+        texts = {f"q{label}": "none" if missed else _write(q), f"xi{label}": xi_text, **named}
         print_rows({f"status{label}": InverseStatus(int(status)).name, **texts})
     # The exit code says whether there is a posture with x.
     if not any(np.isfinite(q).all() and status <= InverseStatus.OUTSIDE_DOMAIN for q, _, status, _ in rows):

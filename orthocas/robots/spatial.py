@@ -10,6 +10,8 @@ from orthocas.errors import InvalidValueError
 from orthocas.tools.checks import Array, freeze_array
 
 _TINY = 1e-24  #: under square roots, so that their derivatives are finite
+_EXACTLY = 1e-9  #: error of R R^T up to which a rotation stays as it is
+_NEARLY = 1e-3  #: the same, up to which the nearest rotation takes its place
 _ROUNDING = 1e-14  #: entries of rotations this close to 0 or +-1 are rounding of rpy -> matrix
 
 
@@ -110,17 +112,22 @@ def constant(values: Array) -> ca.SX:
 
 
 def rotation_matrix(name: str, value: ArrayLike) -> Array:
-    """Check a rotation (3, 3), and return a read-only copy.
+    """A read-only rotation (3, 3). One in single precision or a few decimals gives way to the nearest rotation.
 
     Raises:
-        ShapeError, InvalidValueError: if it is not a rotation matrix.
+        ShapeError, InvalidValueError: if it is off by more than 1e-3.
     """
     rotation = freeze_array(name, value, (3, 3))
     # Products of larger numbers may overflow.
     bounded = np.abs(rotation).max() < 2
-    if not bounded or not np.allclose(rotation @ rotation.T, np.eye(3), atol=1e-9) or np.linalg.det(rotation) < 0:
-        raise InvalidValueError(name, rotation.tolist(), "a rotation matrix")
-    return rotation
+    error = float(np.abs(rotation @ rotation.T - np.eye(3)).max()) if bounded else np.inf
+    if not error < _NEARLY or np.linalg.det(rotation) < 0:
+        wanted = f"a rotation matrix: R R^T = 1 to {_NEARLY:g}, det R = 1"
+        raise InvalidValueError(name, rotation.tolist(), wanted)
+    if error <= _EXACTLY:
+        return rotation
+    left, _, right = np.linalg.svd(rotation)
+    return freeze_array(name, left @ right, (3, 3))
 
 
 def rotate_z_to(axis: Array) -> Array:

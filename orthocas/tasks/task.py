@@ -692,8 +692,9 @@ class Task(Shown, HoldsFunctions):
 
         Args:
             pose: a pose or many of them: matrices (4, 4) or (N, 4, 4); an object with `translation` and `rotation`,
-                such as `pinocchio.SE3`, or a list of such; a pair of position and orientation as in `value`. Or task
-                values (m,) or (N, m), which come back as they are; a rotation matrix is not taken for three of them.
+                such as `pinocchio.SE3`, or a list of such; a pair of position and orientation as in `value`, or a list
+                of pairs. Rotations may be rounded to single precision or three decimals. Or task values (m,) or
+                (N, m), which come back as they are; a rotation matrix is not taken for three of them.
 
         Raises:
             InvalidValueError, ShapeError: if the pose has no meaning for the task, or is none.
@@ -712,6 +713,9 @@ class Task(Shown, HoldsFunctions):
             parts = np.array([row.translation for row in rows]), np.array([row.rotation for row in rows])
             x = self._value_of(*parts)
             return x[0] if rows[0] is pose else x
+        pairs = isinstance(pose, list) and all(isinstance(row, tuple) and len(row) == 2 for row in rows)
+        if pairs and all(np.ndim(row[0]) == 1 for row in rows):
+            pose = tuple(np.array([as_float_array("target", row[k]) for row in pose]) for k in (0, 1))
         # Two task values have one shape, position and orientation have two.
         if isinstance(pose, tuple) and len(pose) == 2:
             position, orientation = (as_float_array("target", part) for part in pose)

@@ -315,7 +315,9 @@ def read_table(
     # The number of rows first: a file of another kind should say so, not complain of its first cell.
     lines = _read_lines(Path(path), what)
     if not least <= len(lines) - 1 <= most:
-        came = f"it has {max(len(lines) - 1, 0)} {rows} after the header"
+        unnamed = lines and all(_is_number(cell) for cell in lines[0][1])
+        header = "its first line, which should name the columns" if unnamed else "the header"
+        came = f"it has {max(len(lines) - 1, 0)} {rows} after {header}"
         raise PathFileError(f"{what} {path}: {came}, expected {least} to {most}")
     header = [cell.strip() for cell in lines[0][1]]
     try:
@@ -323,6 +325,14 @@ def read_table(
         return np.array([_parse_row(line, cells, header, chosen, largest) for line, cells in lines[1:]])
     except ValueError as error:
         raise PathFileError(f"{what} {path}: {error}") from None
+
+
+def _is_number(cell: str) -> bool:
+    try:
+        float(cell)
+    except ValueError:
+        return False
+    return True
 
 
 def find_columns(names: Sequence[str], columns: Sequence[str]) -> list[int]:

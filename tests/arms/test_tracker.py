@@ -5,6 +5,7 @@ from functools import cache
 
 import numpy as np
 import pytest
+from conftest import ROBOTS, robot_data
 from programs import nightly
 
 import orthocas as oc
@@ -220,17 +221,37 @@ def test_without_detours_the_error_of_a_target_at_rest_never_rises() -> None:
         assert (np.diff(errors) <= 1e-7).all()
 
 
-def test_targets_that_are_not_finite_leave_the_arm_where_it_is() -> None:
+def test_targets_that_are_not_finite_or_no_orientation_leave_the_arm_where_it_is() -> None:
     tracker, x = panda().tracker(centre()), panda().x(centre())
     broken = np.eye(4)
     broken[0, 3] = np.nan
-    for bad in (np.full(6, np.nan), np.append(x[:5], np.inf), broken):
+    # No orientation has a vector of a length above 2 = 2 sin(pi/2).
+    beyond = np.append(x[:3], [1.9, 1.9, 0.0])
+    for bad in (np.full(6, np.nan), np.append(x[:5], np.inf), broken, beyond, np.append(x[:3], [0.0, 0.0, 1e9])):
         assert (tracker.step(bad) == centre()).all()
         assert tracker.status is TrackStatus.BAD_INPUT
     assert (tracker.step(x, np.nan) == centre()).all()
     assert tracker.status is TrackStatus.BAD_INPUT
-    tracker.step(x)
+    tracker.step(np.append(x[:3], [0.0, 0.0, 2.0]))
+    assert tracker.status is TrackStatus.BEHIND
+    for _ in range(300):
+        tracker.step(x)
     assert tracker.status is TrackStatus.OK
+
+
+@pytest.mark.slow
+def test_along_a_rail_without_limits_a_tracker_does_the_same_anywhere() -> None:
+    file, tip = ROBOTS["ur5"]
+    robot = oc.Robot.from_urdf(robot_data(file), tip, base="rail:x")
+    arm, rail = oc.Arm(oc.Task.pose(robot)), np.eye(robot.n)[0]
+    for seed in (0, 7, 16):
+        q, goal = (robot.sample(1, seed=k)[0] for k in (seed, 1000 + seed))
+        for shift in (0.0, -1000.0):
+            tracker, x = arm.tracker(q + shift * rail), robot.pose(goal + shift * rail)
+            for _ in range(900):
+                tracker.step(x)
+            assert tracker.status is TrackStatus.OK
+            assert np.abs(robot.pose(tracker.q) - x).max() < 1e-6
 
 
 def test_an_arm_without_charts_keeps_x() -> None:

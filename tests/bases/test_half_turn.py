@@ -361,3 +361,18 @@ def test_jumps_of_orientations_do_not_lead_the_law(tmp_path: Path) -> None:
         assert status in (ControlStatus.OK, ControlStatus.SATURATED)
         np.testing.assert_allclose(led(value), before, atol=2e-3)
         before = led(value)
+
+
+def test_poses_in_single_precision_or_of_a_few_decimals_are_taken() -> None:
+    task, R = oc.Task.pose(arm()), Rotation.from_rotvec([0.3, 1.2, -0.5])
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = R.as_matrix(), [0.4, 0.1, 0.5]
+    x = task.target(pose)
+    for rounded, error in ((pose.astype(np.float32), 1e-7), (pose.round(6), 1e-6), (pose.round(4), 1e-4)):
+        np.testing.assert_allclose(task.target(rounded), x, atol=2 * error)
+    # Off by more, it may be another thing.
+    with pytest.raises(InvalidValueError, match="to 0.001"):
+        task.target(pose.round(2))
+    # A list of pairs is as many poses.
+    pair = (pose[:3, 3], R.as_quat()[[3, 0, 1, 2]])
+    np.testing.assert_allclose(task.target([pair, pair]), [x, x], atol=1e-12)

@@ -65,7 +65,7 @@ static int is_rail(int joint) { return !turning[joint] && !isfinite(high[joint] 
 static int reach(double *q, const double *target, double *t) {
   int round, i, j, k;
   for (round = 0; round < REACH; ++round) {
-    double e[M], J[M * N], L[M][M], inverse[M], y[M], step[N], trace = 0.0, bounded = 0.0, damping, size;
+    double e[M], J[M * N], L[M][M], inverse[M], y[M], step[N], trace = 0.0, share = 0.0, damping, size;
     const double error = task_at(q, target, e, J);
     if (!isfinite(error)) return 0;
     for (i = 0; i < M; ++i) {
@@ -100,9 +100,9 @@ static int reach(double *q, const double *target, double *t) {
       for (i = 0; i < M; ++i) step[k] += J[i + M * k] * y[i];
     }
     size = sqrt(dot(step, step));
-    for (k = 0; k < N; ++k) bounded += is_rail(k) ? 0.0 : step[k] * step[k];
-    bounded = fmin(1.0, LARGEST / (sqrt(bounded) + 1e-300));
-    for (k = 0; k < N; ++k) q[k] += (is_rail(k) ? 1.0 : bounded) * step[k];
+    for (k = 0; k < N; ++k) share += is_rail(k) ? 0.0 : step[k] * step[k];
+    share = fmin(1.0, LARGEST / (sqrt(share) + 1e-300));
+    for (k = 0; k < N; ++k) q[k] += (is_rail(k) ? 1.0 : share) * step[k];
     if (error <= REACHED && size < ARRIVED) return tangent_at(J, t);
   }
   return 0;
