@@ -219,7 +219,7 @@ def test_c_of_a_chart_that_floats_equals_python(satellite: oc.Robot, tmp_path: P
 @pytest.mark.parametrize(
     ("call", "error", "reason"),
     [
-        (lambda chart: oc.control.PDPlus(chart, stiffness=10.0), RobotError, "pd_plus needs joints that motors drive"),
+        (lambda chart: oc.control.PDPlus(chart, stiffness=10.0), RobotError, "pd_plus needs driven joints"),
         (oc.control.Kinematic, RobotError, "no motor drives a floating base"),
         (lambda chart: Projector(chart.problem, 10.0, 1.0), RobotError, "Robot.zero_momentum"),
         (lambda chart: oc.follow(chart, np.zeros((2, 3))), RobotError, "following a path needs"),
