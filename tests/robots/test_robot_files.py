@@ -159,7 +159,10 @@ def test_xacro_files_without_xacro_say_what_to_install(tmp_path: Path, monkeypat
             f'<robot name="a" {XACRO}><xacro:include filename="b"/></robot>',
             "is a xacro file, expected URDF: if you trust it, rename it to .xacro",
         ),
-        ('<robot name="a"><link name="${prefix}b"/></robot>', "is a xacro file, expected URDF: if you trust it, rename it to .xacro"),
+        (
+            '<robot name="a"><link name="${prefix}b"/></robot>',
+            "is a xacro file, expected URDF: if you trust it, rename it to .xacro",
+        ),
         (f'<robot name="a" {XACRO}><link name="b"/><xacro:arm/></robot>', "no movable joint"),
     ],
 )
