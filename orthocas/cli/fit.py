@@ -150,7 +150,7 @@ def _build_problem(name: str, words: ProblemOptions, corridor: Path | None) -> P
     """The problem of a command line, on a corridor around the postures of a file if one is given."""
     if corridor is None:
         return words.build_problem(name)
-    words.require_none(("centre", "home", "least_singular_value"), "--corridor is a domain")
+    words.require_none(("centre", "home", "least_singular_value"), "--corridor defines the domain")
     radius = words.parse_half_width()
     if radius is not None and not isinstance(radius, float):
         raise InvalidValueError("--half-width", words.half_width, "one number, which is the radius of the corridor")
@@ -198,7 +198,7 @@ def _fit_wide(
     monitor: Monitor,
 ) -> WideFit:
     """Fit the wide chart of `--domain branch`; without a name, the branch is that of the home."""
-    words.require_none(("centre", "half_width"), "--domain branch is a domain")
+    words.require_none(("centre", "half_width"), "--domain branch defines the domain")
     base = None if is_robot_file(name) else replace(words, least_singular_value=None).build_problem(name)
     robot, task, metric = _build_parts(name, words, base)
     solid = options.add_to(robot)

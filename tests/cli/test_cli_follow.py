@@ -107,7 +107,7 @@ BROKEN = {
     "x\n1\n2\n": "line 1: column 'y' is missing, expected x, y",
     "x,x\n1,2\n1,2\n": "line 1: column 'x' comes twice",
     "x,xi1\n1,2\n1,2\n": "line 1: column 'y' is missing, expected x, y, xi1",
-    'x,y\n1,2\n1,"2\n': "no CSV text",
+    'x,y\n1,2\n1,"2\n': "not CSV text",
 }
 
 

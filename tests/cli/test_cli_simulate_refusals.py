@@ -29,7 +29,7 @@ from orthocas.tools.progress import Monitor, Progress
         ),
         (("pd_plus", "--feedback", "1"), "which is for kinematic"),
         (("kinematic", "--coupling", "coupled"), "which is for impedance, pd_plus"),
-        (("kinematic", "--mass-factor", "1.1"), "kinematic has no --mass-factor"),
+        (("kinematic", "--mass-factor", "1.1"), "kinematic has no option --mass-factor"),
         (("kinematic", "--friction", "1,1"), "which is for impedance, pd_plus"),
         (("pd_plus", "--coupling", "both"), "unknown coupling 'both', known: coupled, decoupled"),
         (("pd_plus", "--stiffness", "1,2"), "stiffness has shape (2,), expected (3,)"),

@@ -230,7 +230,11 @@ def test_c_of_a_chart_that_floats_equals_python(satellite: oc.Robot, tmp_path: P
         (lambda chart: oc.fit(chart.problem, oc.Linear()), InvalidValueError, "such as Polynomial"),
         (lambda chart: oc.fit(chart.problem, split_idle=False), InvalidValueError, "the base floats"),
         (lambda chart: oc.fit(chart.problem, like="float_x"), InvalidValueError, "a floating base moves"),
-        (lambda chart: oc.fit(chart.problem, oc.Mobile(oc.Polynomial(2))), InvalidValueError, "joints of float_x"),
+        (
+            lambda chart: oc.fit(chart.problem, oc.Mobile(oc.Polynomial(2))),
+            InvalidValueError,
+            "one of the joints float_x",
+        ),
         (lambda chart: oc.Problem(chart.problem.robot, chart.problem.task), MetricError, "expected 'inertia'"),
     ],
 )
