@@ -301,8 +301,8 @@ class Robot(Shown):
 
         Args:
             urdf: the robot's URDF file, or its MJCF file, whose name ends in .xml.
-            srdf: an SRDF file, whose disabled pairs are not checked. Default: the one with the same stem, beside the URDF
-                file or in ../srdf.
+            srdf: an SRDF file, whose disabled pairs are not checked. Default: the one with the same stem, beside the
+                URDF file or in ../srdf.
         """
         locked = {} if self.solids is None else self.solids.locked
         pairs = None if srdf is None else as_path("srdf", srdf)
