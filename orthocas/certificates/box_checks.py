@@ -33,7 +33,7 @@ from orthocas.charts.certificate import ELIMINATION
 from orthocas.tools.batch import one_blas_thread
 from orthocas.tools.checks import Array
 
-_ORTHOGONAL = 1 - 1e-6  #: bound of |det| from below for vectors that are orthogonal up to 1e-9, with up to 20 rows
+_ORTHOGONAL = 1 - 1e-6  #: factor on volumes for singular vectors orthogonal up to 1e-9, with up to 20 rows
 UNKNOWN, NEVER = -1, -2
 _AT_ONCE = 64  #: number of boxes whose models fit into the cache of a processor
 

@@ -67,7 +67,7 @@ class DeterminantRules:
 
 RULES = DeterminantRules()
 SERIES_DEGREE = 5  #: degree of the polynomials; a higher degree costs more and has a smaller truncation error
-_SPLITS = 2**SERIES_DEGREE  #: for each pair of factors, products of two coefficients whose degrees add up to one
+_SPLITS = 2**SERIES_DEGREE  #: most products that sum to one coefficient, for each pair of factors
 
 #: coefficients (..., monomials, boxes) in t from -1 to 1, and a bound of the truncation error
 Expansion = tuple[Array, Array]

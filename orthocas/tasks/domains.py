@@ -279,7 +279,7 @@ PathBound: TypeAlias = "Corridor"  #: a condition on the distance to a path of p
 
 
 class FoldBound(Protocol):
-    """Relative singular values (N,), and displacements of joints in a unit self-motion, (N, n), NaN without one."""
+    """A condition orientation * v(q) > least_volume on the volume of coordinates, as `orthocas.fit_wide` builds it."""
 
     @property
     def gradients(self) -> ca.Function:

@@ -300,7 +300,7 @@ class Guard:
         """Whether a header `Host` can refer to this server. Any port is accepted, because tunnels change it.
 
         A server that other machines can reach does not know all its addresses, behind routers and in containers. So it
-        accepts all numeric addresses, because a foreign name cannot resolve to a request with a numeric `Host`.
+        accepts all numeric addresses, because DNS rebinding always sends a name in `Host`.
         """
         match = _HOST.fullmatch(host.lower())
         if match is None:
