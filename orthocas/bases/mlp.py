@@ -210,7 +210,7 @@ class MLP:
         return f"mlp:{widths}{suffix(self.cyclic, self.without)}"
 
     def for_problem(self, problem: Problem) -> MLP:
-        """The parametrisation with the names of the problem's cyclic joints, if it reduces any."""
+        """The parametrisation with `cyclic="auto"` replaced by the names of the problem's cyclic joints."""
         return replace(self, cyclic=resolved(self.cyclic, problem)) if self.cyclic else self
 
     def family(self, space: JointSpace, outputs: int) -> MLPFamily:

@@ -193,7 +193,7 @@ class Products:
             object.__setattr__(self, "joints", require_count("joints", self.joints))
 
     def for_problem(self, problem: Problem) -> Self:
-        """The parametrisation with the names of the problem's cyclic joints, if any are reduced."""
+        """The parametrisation with `cyclic="auto"` replaced by the names of the problem's cyclic joints."""
         return replace(self, cyclic=resolved(self.cyclic, problem)) if self.cyclic else self
 
     def of_degree(self, degree: int) -> Self:

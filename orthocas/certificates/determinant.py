@@ -299,9 +299,10 @@ def _expand_task_rows(chart: Chart) -> "list[list[Waves]]":
 
 @cache
 def _plan_products(n: int, degree: int) -> tuple[tuple[bool, int, slice, NDArray[np.intp]], ...]:
-    """Plan the product of polynomials a, up to a degree, and b: one coefficient times several of the other factor.
+    """Plan the product of two polynomials, a up to a degree, and b.
 
-    Each entry has: whether the single coefficient belongs to a, its index, indices of the others, and of the products.
+    Each entry multiplies one coefficient of a factor by several of the other. It lists whether the single coefficient
+    belongs to a, its index, the indices of the other coefficients, and the indices of the products.
     """
     # In each pair of degrees, the single coefficient belongs to the factor of lower degree, and to a if both are equal.
     every = list_indices(n, max(SERIES_DEGREE, degree))
@@ -448,7 +449,7 @@ class Waves:
 
     def __mul__(self, other: "Waves") -> "Waves":
         if len(self.coefficients) * len(other.coefficients) > RULES.terms:
-            raise CertifyError("the task Jacobian has too many waves")
+            raise CertifyError("the task Jacobian expands into too many waves, expected a task with fewer joints")
         frequencies = (self.frequencies[:, None] + other.frequencies[None]).reshape(-1, self.frequencies.shape[1])
         coefficients = (self.coefficients[:, None] * other.coefficients[None]).ravel()
         carried = self.error * (other.size + other.error) + self.size * other.error

@@ -387,9 +387,9 @@ def _split(n: int, order: int) -> tuple[Array, Array]:
 def _bound_rest(around: Around, lengths: Array) -> Array:
     """Truncation error of the average with these derivatives of J, (columns, boxes).
 
-    In the next order at the centre, the terms odd in d cancel. The order after it is bounded everywhere between the
-    points. The length of a derivative depends on the last of its joints only, so the bound sums, for each joint, over
-    the joints up to it, weighted by their steps.
+    Two orders remain. In the next order, evaluated at the centre, only the terms even in d count. The order after it is
+    bounded for all points of the segment. The length of a derivative depends on the last of its joints only. So each
+    joint's length is multiplied by a sum over the joints up to it, weighted by their steps.
     """
     # Average over s the sums over all multi-indices, from cumulative sums of centres and differences over the joints.
     next_ = around.order + 1

@@ -142,11 +142,13 @@ def require_all_positions(chart: Chart, variables: Collection[int]) -> None:
     for joint in endless_variables:
         name = problem.robot.joint_names[joint]
         if problem.robot.tree.prismatic[joint] or problem.domain.half_width[joint] < np.pi:
-            raise CertifyError(f"joint '{name}' is unbounded and J depends on it, expected bounds, or a full turn")
+            raise CertifyError(
+                f"joint '{name}' is unbounded and J depends on it, expected bounds, or a half-width of pi"
+            )
         if joint not in alike:
             raise CertifyError(
                 f"joint '{name}' is unbounded and J is not periodic in it, expected bounds, or a task and coordinates "
-                "that are (Fourier, networks of sines and cosines, or a linear term only)"
+                "that are periodic (Fourier terms, networks of sines and cosines, or a linear term in this joint only)"
             )
 
 

@@ -105,7 +105,7 @@ def write_module(chart: Chart | Impedance | PDPlus, to: str, capsules: FittedCap
         require_kind("capsules", capsules, FittedCapsules)
         capsules.collisions.require_for((chart if isinstance(chart, Chart) else chart.chart).problem.robot.tree)
         if not capsules.collisions.pairs:
-            raise InvalidValueError("capsules", "without pairs", "pairs of links")
+            raise InvalidValueError("capsules", "a model without pairs", "a model with pairs of links")
     # A law is exported with its chart.
     laws = []
     if isinstance(chart, TORQUE_LAWS):

@@ -114,7 +114,7 @@ class TermLevels:
     @classmethod
     def of(cls, terms: Iterable[Term], of_derivatives: Iterable[Term]) -> Self:
         """The levels of these terms and of the shorter products that they contain."""
-        # Collect terms with all their leading products. If no derivative needs one, a single term represents them.
+        # A term is computed from its leading products, so collect these too.
         every, lower = with_parts(terms), with_parts(of_derivatives)
         every |= {_split_term(term)[1] for term in every}
         lower = lower or {min(term for term in every if np.count_nonzero(term) == 1)}

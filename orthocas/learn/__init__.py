@@ -126,7 +126,7 @@ class PhiActions(gymnasium.Wrapper[Array, Array, Array, Array]):
         positions = as_float_array("positions", self._positions(self.env))
         if positions.ndim != 1 or len(positions) <= self._joints.max():
             raise InvalidValueError(
-                "positions", f"of shape {positions.shape}", f"a vector with index {self._joints.max()}"
+                "positions", f"of shape {positions.shape}", f"a vector longer than {self._joints.max()}"
             )
         return np.asarray(positions[self._joints])
 

@@ -102,7 +102,7 @@ def fit_capsules(collisions: Collisions) -> FittedCapsules:
     for part in collisions.parts:
         if isinstance(part.shape.geometry, CloudGeometry):
             raise InvalidValueError(
-                "collisions", f"with the point cloud '{part.name}'", "solids that capsules can contain"
+                "collisions", f"a model with the point cloud '{part.name}'", "solids that capsules can contain"
             )
         solids.setdefault(part.name, []).append(part)
     held = {

@@ -161,7 +161,7 @@ def build_coriolis_product(tree: KinematicTree, q: ca.SX, v: ca.SX, w: ca.SX, pa
 
 @dataclass
 class _JointTransform:
-    """Pose of body i in its parent's frame. A constant rotation and Rz(q) cost less apart than multiplied."""
+    """Pose of body i in its parent's frame; a constant rotation and Rz(q) are kept apart, which saves operations."""
 
     rotation: ca.SX  #: constant, (3, 3)
     turn: ca.SX  #: Rz(q) or the identity

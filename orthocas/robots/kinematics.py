@@ -241,7 +241,7 @@ class TipTurn:
         return np.vstack([tilting[_others(axis)], along])
 
     def _split_about_axis(self, turned: ca.SX, p: ca.SX | None) -> ca.SX:
-        """Tilt and turn of a rotation matrix; its quaternion p (w >= 0) gives the turn, except for derivatives (None)."""
+        """Tilt and turn of a rotation matrix; the quaternion p (w >= 0) is None for derivatives."""
         assert self.axis is not None
         axis = _AXES.index(self.axis)
         tilts = tilt(turned, axis, p is None)

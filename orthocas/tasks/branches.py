@@ -425,7 +425,7 @@ def _build_branch(
     whole: Box, cuts: tuple[Cut, ...], sides: tuple[int, ...], points: Array, values: Array
 ) -> Branch | None:
     """The branch between the cuts that `sides` selects; None if it has no clear sample."""
-    # Index k of a joint's side: the interval between its cuts k - 1 and k, or up to a limit.
+    # Side k of a joint is the interval between its cuts k - 1 and k; the first and last sides end at a limit.
     low, high = whole.centre - whole.half_width, whole.centre + whole.half_width
     clear, words = points[values > RULES.nonsingular], []
     for k, side in zip(sorted({cut.joint for cut in cuts}), sides, strict=True):

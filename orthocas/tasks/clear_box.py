@@ -147,12 +147,12 @@ class ClearBox(Box):
 
     @property
     def condition(self) -> Self:
-        """The domain itself."""
+        """The domain itself, which is its own condition."""
         return self
 
     @property
     def singular_bound(self) -> Self:
-        """The domain itself."""
+        """The domain itself, which bounds singular values."""
         return self
 
     @property
@@ -175,7 +175,7 @@ class ClearBox(Box):
         }
 
     def to_data(self) -> tuple[dict[str, Any], dict[str, Array]]:
-        """The bound, and the kind of rows unless it is "x", the kind of older files, which do not name it."""
+        """The bound and the kind of rows. Files without a kind are older and mean "x", so "x" is not written."""
         of_x = self.jacobian_function is self.task.jacobian_function
         rows = {} if of_x else {"judged_rows": self.rows}
         home = {} if self.posture is None else {"home": self.posture}

@@ -93,12 +93,12 @@ class Corridor(Box):
 
     @property
     def condition(self) -> Self:
-        """The domain itself."""
+        """The domain itself, which is its own condition."""
         return self
 
     @property
     def path_bound(self) -> Self:
-        """The domain itself."""
+        """The domain itself, which bounds the distance to its path."""
         return self
 
     def describe_condition(self) -> dict[str, str]:

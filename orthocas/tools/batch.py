@@ -163,7 +163,7 @@ def run_in_threads(work: Callable[[Piece], Result], pieces: Sequence[Piece]) -> 
 def run_in_threads_with(
     tools: Sequence[Tool], work: Callable[[Tool, Piece], Result], pieces: Sequence[Piece]
 ) -> list[Result]:
-    """Like `run_in_threads`, with a tool for each running piece; at most one tool per thread or per piece is used."""
+    """Like `run_in_threads`, but each running piece has a tool to itself; no more tools than threads are needed."""
     # A CasADi function must not run twice at the same time, so each thread borrows one.
     ready: SimpleQueue[Tool] = SimpleQueue()
     for tool in tools:

@@ -121,7 +121,7 @@ def test_half_a_turn_of_an_unbounded_joint_is_not_enough() -> None:
     domain = oc.Box([0.0, 0.0], [1.0, 0.1], [0])
     task = oc.Task.custom(robot, "wave", lambda q: ca.sin(q[0]) + 3 * q[1])
     problem = oc.Problem(robot, task, domain=domain)
-    with pytest.raises(CertifyError, match="expected bounds, or a full turn"):
+    with pytest.raises(CertifyError, match="expected bounds, or a half-width of pi"):
         oc.certify(oc.fit(problem, oc.Given.from_function("xi", 2, lambda q: q[0])).chart)
 
 
