@@ -162,13 +162,13 @@ def keeps_self_motions(problem: Problem, joint: int) -> bool:
     The metric must not depend on the joint, and one of these must hold:
 
     - J_x does not depend on the joint, by the operations of h: h = a q_k + f(other joints). An example is a lift under
-    a pose.
+      a pose.
     - The joint turns everything that the task observes about a line fixed in the world, because only prismatic joints
-    along its axis carry it. Then h(q + t e_k) = g_t(h(q)) with smooth maps g_t, for the tip's position, orientation,
-    pose and axis. This also holds for two components of the position and for polar coordinates, if the axis is exactly
-    the third world axis.
+      along its axis carry it. Then h(q + t e_k) = g_t(h(q)) with smooth maps g_t, for the tip's position, orientation,
+      pose and axis. This also holds for two components of the position and for polar coordinates, if the axis is
+      exactly the third world axis.
     - The joint is the last one, and the task is a whole orientation or pose. The joint changes it by a motion in its
-    own frame.
+      own frame.
 
     Stored rotations are taken as exact, although those of a file are rotations up to rounding only. The result is False
     if no proof is found; the joint may still be cyclic.

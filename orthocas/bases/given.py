@@ -160,10 +160,10 @@ def sew_angle(robot: Robot, kind: str) -> ca.Function:
     point of axis 6 nearest to axis 5; these points move a little.
 
     - conventional: e_t = 0, e_r = z. Then k_x is the part of e_r across e_SW, and psi = 0 in the vertical plane of S
-    and W with the elbow up. It is singular where W is straight above or straight below S, on a line that upright arms
-    reach.
+      and W with the elbow up. It is singular where W is straight above or straight below S, on a line that upright arms
+      reach.
     - stereographic: e_t = -z, e_r = -x. Then k_x is e_r, rotated like e_SW from +z by the shortest way. It is singular
-    only where W is straight below S, on a half-line inside the base of an upright arm.
+      only where W is straight below S, on a half-line inside the base of an upright arm.
 
     Both are undefined where S, E and W lie on one line, as in a stretched arm. Near a singularity the gradient grows
     like 1 / distance. At a singularity psi is arbitrary, and its gradient is huge or NaN. psi jumps between -pi and pi,

@@ -41,7 +41,7 @@ def build_supervision_kernels(controller: Controller) -> list[ca.Function]:
     - implied(q, dq, reference with two derivatives, change) -> A (n, n) row by row and B (n, 3), such that A^-1 B is
       the change, velocity and acceleration of joints that follow the reference, with dq near that velocity;
     - memory(q, dq, reference with two derivatives, gains, command, active, period, fields) -> fields, if the law has
-    one;
+      one;
     - gram(q) and room(q), which measure the distance to singular positions and to folds, if they bound the domain.
     """
     n, m, k = controller.problem.n, controller.problem.m, len(controller.labels)

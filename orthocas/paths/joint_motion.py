@@ -180,10 +180,10 @@ def read_joints(path: str | Path, robot: Robot, topic: str | None = None) -> tup
     """Read times and joint positions of a robot from a recording, in the order of its joints.
 
     - A CSV file has a column of times in seconds, named time_s, __time, time, timestamp or t, and one column per joint.
-    Its name is the joint's name, or a path that ends in that name, or in that name and "position", such as
-    PlotJuggler's `/joint_states/panda_joint1/position`.
+      Its name is the joint's name, or a path that ends in that name, or in that name and "position", such as
+      PlotJuggler's `/joint_states/panda_joint1/position`.
     - An MCAP file of rosbag2 has sensor_msgs/JointState messages. Joints may be spread over several messages: once all
-    joints are known, each message adds a row.
+      joints are known, each message adds a row.
 
     Args:
         path: the file.

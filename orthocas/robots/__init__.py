@@ -6,8 +6,8 @@
 - `urdf` and `mjcf` read URDF, SRDF and MJCF files; `pinocchio_model` locks joints of a `pin.Model`, converts it to a
   tree, and builds planar arms.
 - `collisions` measures distances between links, and from links to a scene. `obstacles` has the scenes and their solids,
-`shapes` the geometry of solids, and `collision_files` reads solids from robot files and chart files. `capsules` bounds
-links by capsules, for C.
+  `shapes` the geometry of solids, and `collision_files` reads solids from robot files and chart files. `capsules`
+  bounds links by capsules, for C.
 """
 
 from orthocas.robots.robot import Robot
