@@ -58,7 +58,7 @@ class Part:
 def doctor(
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")] = False,
 ) -> None:
-    """Show installed and missing packages and their uses, and test a first chart. Exit code 1 if something fails."""
+    """Show installed and missing packages and their uses, and test a first chart. Exit code 1 on failure."""
     parts = list(find_parts())
     core = {part.name: part.version for part in parts if not part.extra}
     faults = [part.fault for part in parts if part.fault and not part.extra]
