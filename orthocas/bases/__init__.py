@@ -63,7 +63,7 @@ def _parse_whole(text: str) -> int:
 
 
 def _parse_products(text: str) -> tuple[int, Cyclic, int | None, tuple[str, ...]]:
-    # DEGREE, then joints=MOST, then joints and what is left out.
+    # The text is DEGREE, then joints=MOST, then the cyclic joints and those that are left out.
     degree, _, rest = text.partition(":")
     most = None
     if rest.startswith(f"{JOINTS}="):

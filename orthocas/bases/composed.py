@@ -1,4 +1,4 @@
-"""Coordinates made of another family's functions: angles of pairs ([AS2023] Sec. 5.1.1; ours), and mobile bases."""
+"""Coordinates built on another family: angles of pairs of functions ([AS2023] Sec. 5.1.1; ours), and mobile bases."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Circle:
-    """xi_j = atan2(v_j, u_j) in (-pi, pi], with pairs (u_j, v_j) from another parametrisation.
+    """Angles xi_j = atan2(v_j, u_j) in (-pi, pi] of pairs (u_j, v_j) from another parametrisation.
 
-    (u_j, v_j) / |(u_j, v_j)| is a point of the unit circle, smooth wherever the pair is not zero, so a closed leaf can
-    have one coordinate without a fold and without a cut. The angle passes from pi to -pi at no particular place.
+    (u_j, v_j) / |(u_j, v_j)| is a point of the unit circle, and smooth wherever the pair is not zero. So one coordinate
+    can cover a closed leaf without a fold. The jump from pi to -pi may lie anywhere on it.
 
     Args:
-        pairs: the parametrisation of the pairs: networks, polynomials or Fourier terms, without cyclic joints.
+        pairs: the parametrisation of the pairs: a network, polynomials or Fourier terms, without cyclic joints.
 
     Raises:
-        InvalidValueError: if the pairs cannot be fitted, or are circle-valued themselves.
+        InvalidValueError: if the pairs cannot be fitted, or are angles themselves.
 
     Example:
         >>> import orthocas as oc
@@ -55,7 +55,7 @@ class Circle:
         if not fitted or self.pairs.closed_form is not None or isinstance(self.pairs, Circle):
             raise InvalidValueError("pairs", repr(self.pairs)[:80], "a parametrisation to fit, such as Fourier(3)")
         if getattr(self.pairs, "cyclic", ()):
-            raise InvalidValueError("pairs", self.pairs.label, "a parametrisation without cyclic joints")
+            raise InvalidValueError("pairs", self.pairs.label, "a parametrisation whose joints are not cyclic")
 
     @property
     def label(self) -> str:
@@ -70,19 +70,21 @@ class Circle:
         """The family on the given joints.
 
         Raises:
-            InvalidValueError: if linear combinations of the functions of the pairs are not in their family.
+            InvalidValueError: if the family of the pairs does not contain linear combinations of its functions.
         """
         pairs = self.pairs.family(space, 2 * outputs)
         if not isinstance(pairs, CombinableFamily):
-            raise InvalidValueError("pairs", self.pairs.label, "a family with `combined`, see CombinableFamily")
+            raise InvalidValueError(
+                "pairs", self.pairs.label, "a family with the method `combined`, see CombinableFamily"
+            )
         return CircleFamily(pairs, outputs)
 
 
 @dataclass(frozen=True, eq=False)
 class CircleFamily:
-    """Angles of pairs. theta holds the parameters of the pairs u_1..u_r, v_1..v_r, and a constant for each of them.
+    """Angles of pairs. theta holds the parameters of u_1..u_r, v_1..v_r, then a constant for each of these functions.
 
-    The constants are left out for families that have them, such as networks.
+    Families with constants of their own, such as networks, need no further ones.
     """
 
     pairs: Family
@@ -90,7 +92,7 @@ class CircleFamily:
 
     @cached_property
     def constants(self) -> int:
-        """Number of constants: bases have none of their own."""
+        """Number of additional constants: 2 r for families without constants, otherwise 0."""
         return 2 * self.outputs if isinstance(self.pairs, LinearFamily) else 0
 
     @property
@@ -100,17 +102,17 @@ class CircleFamily:
 
     @property
     def periods(self) -> Array:
-        """2 pi for all, (r,)."""
+        """Period 2 pi for each component, (r,)."""
         return np.full(self.outputs, TURN)
 
     @property
     def as_matrices(self) -> bool:
-        """What the pairs say."""
+        """The value of the family of the pairs."""
         return self.pairs.as_matrices
 
     @property
     def width(self) -> int:
-        """What the pairs say."""
+        """The value of the family of the pairs."""
         return self.pairs.width
 
     def expression(self, q: Expression, theta: Expression) -> Expression:
@@ -121,7 +123,7 @@ class CircleFamily:
 
     def jacobian(self, q: Expression, theta: Expression) -> list[Expression]:
         """Gradients (u dv - v du) / (u^2 + v^2), r matrices (n, N)."""
-        # Those of u and v, row by row over |(u, v)|^2.
+        # Divide the gradients of u and v by |(u, v)|^2, then combine them.
         u, v = self._pairs(q, theta)
         slopes = self.pairs.jacobian(q, theta[: self.pairs.size])
         squared, n = u**2 + v**2, q.shape[0]
@@ -132,7 +134,7 @@ class CircleFamily:
         return gradients
 
     def initial(self, seed: int) -> Array:
-        """A start of the pairs, with constants of zero, (size,)."""
+        """Starting point of the pairs, with constants of zero, (size,)."""
         return np.concatenate([self.pairs.initial(seed), np.zeros(self.constants)])
 
     def reordered(self, theta: Array, order: Sequence[int]) -> Array:
@@ -141,8 +143,8 @@ class CircleFamily:
         return self._combine(theta, np.block([[pick, none], [none, pick]]))
 
     def turned(self, theta: Array, angles: Array) -> Array:
-        """Parameters of xi - angles, (size,): every pair is turned back by its angle (r,) [rad]."""
-        # A turn of the plane of each pair.
+        """Parameters of xi - angles, (size,): each pair is rotated by minus its angle (r,) [rad]."""
+        # Rotate the plane of each pair.
         c, s = np.diag(np.cos(angles)), np.diag(np.sin(angles))
         return self._combine(theta, np.block([[c, s], [-s, c]]))
 
@@ -160,29 +162,31 @@ class CircleFamily:
         return values[: self.outputs, :], values[self.outputs :, :]
 
 
-_START = 0.03  # of the arm's own start, where coordinates move with a base
-_ON_PLANE = 3  # coordinates that move with the base: two of its place, and the heading
+# Factor on the arm's own starting point if the coordinates move with a base.
+_START = 0.03
+# Number of coordinates that move with the base: two of its position, and its heading.
+_ON_PLANE = 3
 
 
 @dataclass(frozen=True)
 class Mobile:
-    """Coordinates that turn and shift with a base that moves on a plane.
+    """Coordinates that turn and shift with a base that moves in the plane.
 
-    With the place p = (x, y) and the heading t of the base, and functions f of the arm's joints a,
+    With the position p = (x, y) and the heading t of the base, and functions f of the arm's joints a,
 
         (xi_1, xi_2) = p + R(t) (f_1(a) + b_1, f_2(a) + b_2),  xi_3 = t + f_3(a),  xi_k = c_k t + f_k(a) for k > 3.
 
-    A motion of the plane turns and shifts (xi_1, xi_2), adds its angle to t, and does the same to the tip. So where the
-    metric does not depend on place and heading, J_x A^-1 J_xi^T and det J are those at p = 0, t = 0, up to a rotation:
-    a chart holds everywhere on the plane, and `fit` takes away the ends of the domain there.
+    A motion in the plane turns and shifts (xi_1, xi_2) and adds its angle to t; it does the same to the tip. If the
+    metric does not depend on position and heading, J_x A^-1 J_xi^T and det J are therefore those at p = 0, t = 0, up to
+    a rotation. So a chart holds everywhere on the plane, and `fit` makes the domain unbounded there.
 
     Args:
-        arm: the parametrisation of f: polynomials, Fourier terms or networks, without cyclic joints.
-        base: names of the two joints that slide along the world's x and y, and of the one that turns about z after
-            them. Default: those of `Robot.from_urdf(..., base="planar")`.
+        arm: the parametrisation of f: polynomials, Fourier terms or a network, without cyclic joints.
+        base: names of three joints: two that slide along the world's x and y, and one that then turns about z. Default:
+            those of `Robot.from_urdf(..., base="planar")`.
 
     Raises:
-        InvalidValueError: if f cannot be fitted, or the names are not three.
+        InvalidValueError: if f cannot be fitted, or there are not three different names.
 
     Example:
         >>> import orthocas as oc
@@ -199,13 +203,12 @@ class Mobile:
     closed_form = None
 
     def __post_init__(self) -> None:
-        # A parametrisation to fit, without joints of its own that are cyclic.
+        # Check that f can be fitted and has no cyclic joints.
         fitted = isinstance(self.arm, Parametrisation) and not isinstance(self.arm, type)
         if not fitted or self.arm.closed_form is not None or isinstance(self.arm, Mobile):
             raise InvalidValueError("arm", repr(self.arm)[:80], "a parametrisation to fit, such as Polynomial(2)")
         if getattr(self.arm, "cyclic", ()):
-            raise InvalidValueError("arm", self.arm.label, "a parametrisation without cyclic joints")
-        # Three joints of the base, by their names.
+            raise InvalidValueError("arm", self.arm.label, "a parametrisation whose joints are not cyclic")
         names = tuple(self.base) if isinstance(self.base, tuple | list) else ()
         if len({*names}) != _ON_PLANE or not all(isinstance(name, str) for name in names):
             raise InvalidValueError("base", repr(self.base)[:80], "names of three joints: x, y and the heading")
@@ -225,8 +228,8 @@ class Mobile:
         tree = problem.robot.tree
         missing = [name for name in self.base if name not in tree.joint_names]
         if missing:
-            raise InvalidValueError("base", repr(missing[0]), f"joints of {', '.join(tree.joint_names)}")
-        # From the world on: x, y and the heading, each exactly along its axis of the world.
+            raise InvalidValueError("base", repr(missing[0]), f"one of the joints {', '.join(tree.joint_names)}")
+        # The first three joints from the world on must be x, y and the heading, exactly along the axes of the world.
         R, parent = np.eye(3), -1
         for name, kind, axis in zip(self.base, ("prismatic", "prismatic", "revolute"), range(3), strict=True):
             k = tree.joint_names.index(name)
@@ -241,7 +244,7 @@ class Mobile:
         """The family on the given joints.
 
         Raises:
-            InvalidValueError: if there are less than three coordinates, or joints of the base are missing.
+            InvalidValueError: if there are fewer than three coordinates, or joints of the base are missing.
         """
         if outputs < _ON_PLANE:
             raise InvalidValueError("extra coordinates of a mobile base", outputs, f"at least {_ON_PLANE}")
@@ -258,8 +261,8 @@ class MobileFamily:
     """The coordinates of `Mobile`. theta holds the parameters of f, then b_1, b_2, then c_4..c_r."""
 
     arm: Family
-    places: tuple[int, ...]  #: of the base's joints
-    joints: tuple[int, ...]  #: of the arm
+    places: tuple[int, ...]  #: indices of the base's joints
+    joints: tuple[int, ...]  #: indices of the arm's joints
 
     @property
     def outputs(self) -> int:
@@ -273,22 +276,22 @@ class MobileFamily:
 
     @property
     def as_matrices(self) -> bool:
-        """What the functions of the arm say."""
+        """The value of the arm's family."""
         return self.arm.as_matrices
 
     @property
     def width(self) -> int:
-        """What the functions of the arm say."""
+        """The value of the arm's family."""
         return self.arm.width
 
     def expression(self, q: Expression, theta: Expression) -> Expression:
         """xi, (r, N), for q (n, N)."""
-        # The arm's coordinates, the first two of them in the axes of the base.
+        # Coordinates of the arm; the first two are in the axes of the base.
         own, rest = theta[: self.arm.size], theta[self.arm.size :]
         f = self.arm.expression(q[list(self.joints), :], own)
         x, y, heading = (q[i, :] for i in self.places)
         ahead, aside = f[0, :] + rest[0], f[1, :] + rest[1]
-        # Turned by the heading and shifted by the place, they are those of the world.
+        # Turn them by the heading and shift them by the position.
         c, s = ca.cos(heading), ca.sin(heading)
         rows = [x + c * ahead - s * aside, y + s * ahead + c * aside, heading + f[2, :]]
         rows += [rest[k - 1] * heading + f[k, :] for k in range(_ON_PLANE, self.outputs)]
@@ -300,8 +303,9 @@ class MobileFamily:
         return component_gradients(self.expression(q, theta), q)
 
     def initial(self, seed: int) -> Array:
-        """Nearly the place and the heading of the base, (size,).
+        """Coordinates close to position and heading of the base, (size,).
 
-        With larger f_1 and f_2, a fit can let them grow without end, so that (xi_1, xi_2) leaves the place out.
+        If f_1 and f_2 start larger, a fit may let them grow without bound, so that the base's position becomes
+        negligible.
         """
         return np.concatenate([_START * self.arm.initial(seed), np.zeros(self.size - self.arm.size)])

@@ -1,4 +1,4 @@
-"""Parametrisations xi_theta(q): families by what they can do, bases of functions, joints in labels, the registry."""
+"""Parametrisations xi_theta(q): protocols of families, bases of functions, labels, and the registry."""
 
 from __future__ import annotations
 
@@ -21,13 +21,13 @@ if TYPE_CHECKING:
 
 
 class ArrayMemory:
-    """Arrays by name. One computation at a time uses them; the next one overwrites their values."""
+    """Named arrays that are reused. One computation at a time may use them, because the next one overwrites them."""
 
     def __init__(self) -> None:
         self._arrays: dict[tuple[Any, ...], NDArray[Any]] = {}
 
     def array(self, name: str, shape: tuple[int, ...], dtype: DTypeLike) -> NDArray[Any]:
-        """The array of this name, shape and type; its first values are arbitrary."""
+        """The array of this name, shape and type, with arbitrary values."""
         key = (name, shape, np.dtype(dtype))
         if key not in self._arrays:
             self._arrays[key] = np.empty(shape, dtype)
@@ -35,16 +35,16 @@ class ArrayMemory:
 
 
 class Memories:
-    """Memories that threads borrow."""
+    """A pool of memories for threads."""
 
     def __init__(self) -> None:
         self._spare: list[ArrayMemory] = []
 
     @contextmanager
     def borrow(self, count: int) -> Iterator[list[ArrayMemory]]:
-        """So many memories that nobody else uses meanwhile."""
+        """Lend `count` memories that nobody else uses meanwhile."""
         borrowed: list[ArrayMemory] = []
-        # Take spare ones, and make those that are missing; all come back for others.
+        # Take free memories, and create the missing ones. All return to the pool afterwards.
         for _ in range(count):
             try:
                 borrowed.append(self._spare.pop())
@@ -58,12 +58,12 @@ class Memories:
 
 TURN = 2 * np.pi  #: period of coordinates that are angles [rad]
 Expression = TypeVar("Expression", ca.SX, ca.MX)
-Pulled = Callable[[Array, Array], Array]  #: a derivative that is pulled back, and the array that takes the result
+Pulled = Callable[[Array, Array], Array]  #: derivatives dL/dJ_xi, array for the result -> dL/dtheta
 
 
 @dataclass(frozen=True, eq=False)
 class JointSpace:
-    """The joints that a family depends on: the box for scaling, and which joints are prismatic."""
+    """The joints of a family, with the box that scales them, and whether each is prismatic."""
 
     centre: Array  #: (n,)
     half_width: Array  #: (n,), > 0
@@ -104,7 +104,7 @@ class Family(Protocol):
 
     @property
     def as_matrices(self) -> bool:
-        """Whether the family consists of dense products. Then it needs MX graphs with samples as columns, not SX."""
+        """Whether the family consists of dense products, and so needs MX graphs with samples as columns, not SX."""
 
     @property
     def width(self) -> int:
@@ -122,19 +122,19 @@ class Family(Protocol):
 
 @runtime_checkable
 class ArrayFamily(Family, Protocol):
-    """A family whose coordinate gradients NumPy computes, with their derivative, in any precision."""
+    """A family whose gradients NumPy computes in any precision, together with derivatives of a loss of them."""
 
     def pullback(self, points: Array, theta: Array, memory: ArrayMemory | None = None) -> tuple[Array, Pulled]:
-        """J_xi at points, and the derivative of any function L of it.
+        """J_xi at points, and a function that computes dL/dtheta for any loss L(J_xi).
 
         Args:
             points: joint positions, (N, n).
-            theta: parameters, (size,). Products are computed with numbers of its type.
-            memory: arrays of earlier calls, which this one overwrites. Nobody else may use them meanwhile.
+            theta: parameters, (size,). All products have its type.
+            memory: reused arrays, which this call overwrites. Nobody else may use them meanwhile.
 
         Returns:
-            J_xi, (N, r, n), and the map from dL/dJ_xi (N, r, n) to dL/dtheta. It writes to an array (size,) of theta's
-            type and returns it.
+            J_xi, (N, r, n), and the map from dL/dJ_xi (N, r, n) to dL/dtheta. The map writes to an array (size,) of
+            theta's type, and returns it.
         """
 
 
@@ -156,7 +156,7 @@ class CombinableFamily(Family, Protocol):
 
 @runtime_checkable
 class PeriodicFamily(Family, Protocol):
-    """A family with components that are angles and jump by whole turns."""
+    """A family with angles as components, which jump by full turns."""
 
     @property
     def periods(self) -> Array:
@@ -166,9 +166,10 @@ class PeriodicFamily(Family, Protocol):
 
 @runtime_checkable
 class LinearFamily(Family, Protocol):
-    """A family linear in its parameters: xi_theta(q) = C psi(q), where theta holds the rows of C (r, K) in a row.
+    """A family linear in its parameters: xi_theta(q) = C psi(q). theta holds the rows of C (r, K), one after the other.
 
-    No basis function is constant: a constant does not change J_xi. `BasisFamily` builds such a family for any basis.
+    No basis function is constant, because a constant does not change J_xi. `BasisFamily` builds such a family for any
+    basis.
     """
 
     def basis(self, q: Expression) -> Expression:
@@ -185,7 +186,7 @@ class GradedFamily(LinearFamily, Protocol):
 
 @runtime_checkable
 class SelfDerivativeFamily(LinearFamily, Protocol):
-    """A linear family whose derivatives are sums of its own functions. Controllers and C need no other basis."""
+    """A linear family that contains the derivatives of its functions, so controllers and C need no other basis."""
 
     def derivative_tables(self, theta: Array) -> Array:
         """C_i with d xi / d q_i = C_i (1, psi), (n, r, 1 + K)."""
@@ -197,12 +198,12 @@ class ClosedForm:
 
     theta: Array  #: parameters of the family, (size,)
     origin: Array | None = None  #: joint position where xi = 0, (n,). Default: the centre of the domain
-    scaled: bool = True  #: whether coordinates are scaled to a mean gradient length of 1
+    scaled: bool = True  #: whether to scale coordinates to a mean gradient length of 1
 
 
 @runtime_checkable
 class Parametrisation(Protocol):
-    """The choice of a family, before the joints are known. It holds plain settings only."""
+    """A choice of a family before the joints are known. It holds plain settings only."""
 
     @property
     def label(self) -> str:
@@ -210,21 +211,21 @@ class Parametrisation(Protocol):
 
     @property
     def linear(self) -> bool:
-        """Whether its families are linear in their parameters. Then `fit` minimises by Gauss-Newton or QuasiNewton."""
+        """Whether its families are linear in their parameters, so that `fit` uses Gauss-Newton or QuasiNewton."""
 
     @property
     def closed_form(self) -> Callable[[Problem], ClosedForm] | None:
-        """The function that gives the parameters without a fit, or None if they are fitted."""
+        """The function that returns the parameters without a fit; None if they are fitted."""
 
     def for_problem(self, problem: Problem) -> Parametrisation:
-        """The parametrisation for this problem. It is the object itself if it does not depend on the problem."""
+        """The parametrisation for this problem; the same object if it does not depend on the problem."""
 
     def family(self, space: JointSpace, outputs: int) -> Family:
         """The family on the given joints, with `outputs` components."""
 
 
 def require_parametrisation(value: object) -> None:
-    """Raise InvalidValueError unless it is a parametrisation."""
+    """Raise InvalidValueError unless the value is a parametrisation."""
     if not isinstance(value, Parametrisation) or isinstance(value, type):
         raise InvalidValueError("parametrisation", repr(value), "an object such as Polynomial(degree=4)")
 
@@ -249,11 +250,11 @@ class GradedParametrisation(Parametrisation, Protocol):
 
 @runtime_checkable
 class CyclicParametrisation(Parametrisation, Protocol):
-    """A parametrisation that can reduce joints to one linear term each, so that charts hold at all their positions."""
+    """A parametrisation in which joints may have only a linear term, so that charts hold at all their positions."""
 
     @property
     def cyclic(self) -> Sequence[str]:
-        """Names of these joints, after `for_problem`."""
+        """Names of these joints, known after `for_problem`."""
 
 
 def component_gradients(xi: Expression, q: Expression) -> list[Expression]:
@@ -273,12 +274,12 @@ def component_gradients(xi: Expression, q: Expression) -> list[Expression]:
 
 @dataclass(frozen=True, eq=False)
 class BasisFamily:
-    """xi_theta(q) = C psi(q), where theta holds the rows of C (r, K) one after the other.
+    """xi_theta(q) = C psi(q). theta holds the rows of C (r, K), one after the other.
 
     Args:
         space: the joints.
         outputs: number r of components.
-        functions: psi, a map of SX or MX columns q (n, N) to (K, N), column by column. No function may be constant.
+        functions: psi, a function that maps SX or MX columns q (n, N) to (K, N). No component may be constant.
     """
 
     space: JointSpace
@@ -307,7 +308,7 @@ class BasisFamily:
 
     @cached_property
     def _of_one(self) -> ca.Function:
-        """psi for one joint position: built once, since expressions take longer to build than to copy."""
+        """psi for one joint position, built once, because copies are faster than new expressions."""
         q = ca.SX.sym("q", self.space.n)
         return ca.Function("basis", [q], [self.functions(q)])
 
@@ -333,11 +334,12 @@ class BasisFamily:
 
 
 Cyclic = tuple[str, ...] | Literal["auto"]  #: names of joints; "auto" for all cyclic joints of the problem
-_CYCLIC, _WITHOUT = "cyclic", "without"  # words of labels
+# Words in labels.
+_CYCLIC, _WITHOUT = "cyclic", "without"
 
 
 def check_joint_names(cyclic: Any, without: Any) -> tuple[Cyclic, tuple[str, ...]]:
-    """Names of joints that enter linearly, or "auto", and of joints that coordinates do not depend on.
+    """Check names of joints with a linear term (or "auto"), and names of joints that coordinates do not depend on.
 
     Raises:
         InvalidValueError: if a name appears twice, or one is in both.
@@ -359,22 +361,22 @@ def check_joint_names(cyclic: Any, without: Any) -> tuple[Cyclic, tuple[str, ...
 
 
 def suffix(cyclic: Cyclic, without: tuple[str, ...] = ()) -> str:
-    """What a label adds: ':cyclic' for "auto", ':cyclic=NAME,NAME', and ':without=NAME,NAME'."""
+    """The end of a label: ':cyclic' for "auto", ':cyclic=NAME,NAME', and ':without=NAME,NAME'."""
     linear = "" if not cyclic else f":{_CYCLIC}" if cyclic == "auto" else f":{_CYCLIC}={','.join(cyclic)}"
     return linear + (f":{_WITHOUT}={','.join(without)}" if without else "")
 
 
 def parse_suffix(text: str, before: str) -> tuple[Cyclic, tuple[str, ...]]:
-    """Parse what ends a label: '', 'cyclic' or 'cyclic=NAME,NAME', then 'without=NAME,NAME'.
+    """Parse the end of a label: '', 'cyclic' or 'cyclic=NAME,NAME', then 'without=NAME,NAME'.
 
     Args:
         text: the end of the label.
-        before: what may stand before it, for messages.
+        before: what else the label may contain before it, for messages.
     """
     cyclic: Cyclic = ()
     without: tuple[str, ...] = ()
     for part in text.split(":") if text else ():
-        # each part is a word, with names behind it
+        # Each part is a word, optionally followed by = and names.
         word, equals, names = part.partition("=")
         if word not in (_CYCLIC, _WITHOUT) or (not names if equals else word == _WITHOUT):
             wanted = f"{before}, then 'cyclic' or 'cyclic=JOINT,JOINT', then 'without=JOINT'"
@@ -387,22 +389,22 @@ def parse_suffix(text: str, before: str) -> tuple[Cyclic, tuple[str, ...]]:
 
 
 def indices(cyclic: Cyclic, space: JointSpace) -> list[int]:
-    """The cyclic joints of a space, in order.
+    """Indices of the cyclic joints of a space, in order.
 
     Raises:
         InvalidValueError: if a name is not among the joints, or "auto" has not been resolved.
     """
     if cyclic == "auto":
-        raise InvalidValueError("cyclic", "'auto'", "joint names: for_problem(problem) finds them")
+        raise InvalidValueError("cyclic", "'auto'", "joint names, which for_problem(problem) finds")
     for name in cyclic:
         if name not in space.joint_names:
-            raise InvalidValueError("cyclic", repr(name), f"joints of {', '.join(space.joint_names)}")
+            raise InvalidValueError("cyclic", repr(name), f"one of the joints {', '.join(space.joint_names)}")
     return [k for k, name in enumerate(space.joint_names) if name in cyclic]
 
 
 @dataclass(frozen=True)
 class Registration:
-    """A parametrisation that chart files and the command line support."""
+    """A parametrisation for chart files and the command line."""
 
     kind: type[Parametrisation]
     parse: Callable[[str], Parametrisation] | None  #: parses the text after 'name:' on the command line
@@ -441,7 +443,7 @@ def register_parametrisation(
     require_kind("name", name, str)
     before = _REGISTERED.get(name)
     if before is not None and before.kind is not kind:
-        raise InvalidValueError("name", repr(name), f"a name that {before.kind.__name__} does not use")
+        raise InvalidValueError("name", repr(name), f"another name, because {before.kind.__name__} has this one")
     if not isinstance(kind, type) or not is_dataclass(kind):
         raise InvalidValueError("kind", repr(kind), "a dataclass: chart files store its fields")
     _REGISTERED[name] = Registration(kind, parse)
@@ -453,7 +455,7 @@ def parametrisation_names() -> tuple[str, ...]:
 
 
 def warn_unless_savable(parametrisation: Parametrisation) -> None:
-    """Issue a NotSavableWarning, before a fit, if its chart cannot be saved."""
+    """Issue a NotSavableWarning before a fit if its chart cannot be saved."""
     try:
         parametrisation_to_data(parametrisation)
     except InvalidValueError as error:
@@ -463,8 +465,8 @@ def warn_unless_savable(parametrisation: Parametrisation) -> None:
 def parametrisation_to_data(parametrisation: Parametrisation) -> dict[str, Any]:
     """Convert a parametrisation to plain data: kind and settings.
 
-    A setting that came later may have the metadata {"stored": "if given"}: data leave it out while it is None or empty,
-    so that charts of before keep their fingerprints.
+    New settings may have the metadata {"stored": "if given"}. They are left out while they are None or empty, so that
+    the fingerprints of older charts stay the same.
 
     Raises:
         InvalidValueError: if it is not registered, or its settings are not plain data.
@@ -474,9 +476,9 @@ def parametrisation_to_data(parametrisation: Parametrisation) -> dict[str, Any]:
         raise InvalidValueError(
             "parametrisation",
             kind.__name__,
-            f"a registered one, so that it can be saved: orthocas.register_parametrisation('...', {kind.__name__})",
+            f"a registered class: orthocas.register_parametrisation('...', {kind.__name__})",
         )
-    # Settings that are parametrisations become data themselves.
+    # A setting that is itself a parametrisation is converted too.
     parts = {part.name: getattr(parametrisation, part.name) for part in fields(parametrisation)}
     inner = {name: parametrisation_to_data(part) for name, part in parts.items() if isinstance(part, Parametrisation)}
     settings = {**asdict(parametrisation), **inner}
@@ -491,7 +493,7 @@ def parametrisation_to_data(parametrisation: Parametrisation) -> dict[str, Any]:
 
 
 def parametrisation_from_data(data: Mapping[str, Any]) -> Parametrisation:
-    """Convert the result of `parametrisation_to_data` back.
+    """Rebuild a parametrisation from the result of `parametrisation_to_data`.
 
     Raises:
         UnknownNameError: if no such parametrisation is registered.
@@ -504,19 +506,19 @@ def parametrisation_from_data(data: Mapping[str, Any]) -> Parametrisation:
     kind = kinds[name]
     require_kind("settings", settings, dict)
     names = {field.name for field in fields(kind)}  # type: ignore[arg-type]
-    # Settings that are parametrisations themselves.
+    # A setting may itself be a parametrisation.
     inner = {name: part for name, part in settings.items() if isinstance(part, dict) and "parametrisation" in part}
     settings = settings | {name: parametrisation_from_data(part) for name, part in inner.items()}
     if not settings.keys() <= names:
-        raise InvalidValueError(f"settings of {kind.__name__}", sorted(settings), f"some of {sorted(names)}")
+        raise InvalidValueError(f"settings of {kind.__name__}", sorted(settings), f"only names among {sorted(names)}")
     return kind(**settings)
 
 
 def parse_parametrisation(label: str) -> Parametrisation:
-    """Parse a label: 'polynomial:4:joints=2', 'fourier:2:cyclic', 'mlp:64x64:raw', 'circle:mlp:32x32', 'linear', yours.
+    """Parse a label such as 'polynomial:4:joints=2', 'fourier:2:cyclic', 'mlp:64x64:raw', 'circle:mlp:32x32', 'linear'.
 
     Raises:
-        UnknownNameError: if there is no such parametrisation.
+        UnknownNameError: if no parametrisation of this name is registered.
         InvalidValueError: if the text after the colon is invalid.
     """
     require_kind("parametrisation", label, str)

@@ -1,4 +1,4 @@
-"""Coordinates given in closed form, also the shoulder-elbow-wrist angle. Their charts need no fit."""
+"""Coordinates in closed form, which need no fit; for example the shoulder-elbow-wrist angle."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ from orthocas.tools.expressions import Tape, build_expression, replay, require_t
 
 SEWKind = Literal["conventional", "stereographic"]
 SEW_KINDS: tuple[SEWKind, ...] = ("conventional", "stereographic")
-# (e_t, e_r) in the world. The singular half-line e_t points down into the base. With e_r = -x, an arm that reaches
-# along +x with its elbow up has psi = 0, far from the jump at +-pi.
+# (e_t, e_r) in the world. The singular half-line e_t points down into the base. With e_r = -x, an arm with its elbow up
+# that reaches along +x has psi = 0, far from the jump at +-pi.
 DIRECTIONS = {"conventional": ((0.0, 0.0, 0.0), (0.0, 0.0, 1.0)), "stereographic": ((0.0, 0.0, -1.0), (-1.0, 0.0, 0.0))}
 
 
 @dataclass(frozen=True, slots=True)
 class GivenRules:
-    """Numbers of given coordinates and of the angle of the elbow."""
+    """Numbers of closed-form coordinates and of the elbow angle."""
 
-    most_joints: int = 1000  #: of a function without a robot
-    meeting: float = 1e-5  #: axes closer than this meet [m]
-    parallel: float = 1e-6  #: axes at a smaller angle are parallel [rad]
+    most_joints: int = 1000  #: largest number of joints of a function without a robot
+    meeting: float = 1e-5  #: [m]; axes nearer than this intersect
+    parallel: float = 1e-6  #: [rad]; axes at a smaller angle are parallel
 
 
 RULES = GivenRules()
@@ -82,11 +82,11 @@ class Given:
         return cls(name, n, write_tape(dense_function("xi", [q], [xi])))
 
     def for_problem(self, problem: Problem) -> Given:
-        """The object itself: it does not depend on the problem."""
+        """The same object: it does not depend on the problem."""
         return self
 
     def closed_form(self, problem: Problem) -> ClosedForm:
-        """There are no parameters."""
+        """No parameters."""
         return ClosedForm(np.zeros(0))
 
     def family(self, space: JointSpace, outputs: int) -> GivenFamily:
@@ -102,7 +102,7 @@ class Given:
 
 @dataclass(frozen=True, eq=False)
 class GivenFamily:
-    """The one function of a `Given`."""
+    """The family with the one function of a `Given`."""
 
     given: Given
     outputs: int
@@ -111,7 +111,7 @@ class GivenFamily:
 
     @cached_property
     def width(self) -> int:
-        """Number of steps of the tape."""
+        """Number of operations on the tape."""
         return len(self.given.tape["steps"])
 
     @cached_property
@@ -134,7 +134,7 @@ class GivenFamily:
 
 
 def find_periods(tape: Tape) -> Array:
-    """2 pi for components that are an atan2 themselves, so that they jump by a whole turn, 0 for others, (r,)."""
+    """2 pi for components that are results of atan2, and so jump by a full turn; 0 for others, (r,)."""
     angles, periods = set[int](), np.zeros(tape["rows"])
     for name, into, *of in tape["steps"]:
         if name == "output":
@@ -149,27 +149,28 @@ def find_periods(tape: Tape) -> Array:
 def sew_angle(robot: Robot, kind: str) -> ca.Function:
     """The SEW angle psi(q): the rotation of the elbow about the line from shoulder to wrist.
 
-    S is the point where axes 1, 2 and 3 meet, W the point where axes 5 and 6 meet, E the point of axis 4 nearest to
-    axis 3. With p_SE = E - S, p_SW = W - S and e_SW = p_SW / |p_SW|,
+    S is the point where axes 1, 2 and 3 intersect, W the point where axes 5 and 6 intersect, and E the point of axis 4
+    nearest to axis 3. With p_SE = E - S, p_SW = W - S and e_SW = p_SW / |p_SW|,
 
         k_r = (e_SW - e_t) x e_r,  k_x = k_r x p_SW,  psi = atan2(e_SW . (k_x x p_SE), k_x . p_SE).
 
-    This is the right-handed angle about e_SW from the half-plane of k_x to the half-plane of E. If axis 7 also meets W,
-    a motion that keeps the tip's pose rotates E about a fixed line, and psi by the same angle. Otherwise W moves with
-    the elbow. Where axes pass each other at a distance, as on a Baxter, S is the point of axis 2 nearest to axis 3, and
-    W that of axis 6 nearest to axis 5: they move a little, too.
+    This is the right-handed angle about e_SW from the half-plane of k_x to the half-plane of E. If axis 7 also passes
+    through W, a self-motion rotates E about a fixed line, and changes psi by the same angle. Otherwise W moves with the
+    elbow. If these axes do not intersect, as on a Baxter, S is the point of axis 2 nearest to axis 3, and W is the
+    point of axis 6 nearest to axis 5; these points move a little.
 
-    - conventional: e_t = 0, e_r = z, so that k_x is e_r across e_SW: psi = 0 in the vertical plane of S and W with
-      the elbow up. Singular where W is straight above or straight below S: a line, which upright arms reach.
-    - stereographic: e_t = -z, e_r = -x, so that k_x is e_r rotated with e_SW from +z by the shortest way.
-      Singular only where W is straight below S: a half-line, inside the base of an upright arm.
+    - conventional: e_t = 0, e_r = z. Then k_x is the part of e_r across e_SW, and psi = 0 in the vertical plane of S
+      and W with the elbow up. It is singular where W is straight above or straight below S, on a line that upright arms
+      reach.
+    - stereographic: e_t = -z, e_r = -x. Then k_x is e_r, rotated like e_SW from +z by the shortest way. It is singular
+      only where W is straight below S, on a half-line inside the base of an upright arm.
 
     Both are undefined where S, E and W lie on one line, as in a stretched arm. Near a singularity the gradient grows
     like 1 / distance. At a singularity psi is arbitrary, and its gradient is huge or NaN. psi jumps between -pi and pi,
-    its gradient does not.
+    but its gradient is continuous there.
 
     Args:
-        robot: a chain of seven revolute joints. Its z axis is the up direction above.
+        robot: a chain of seven revolute joints. Its world's z axis is the up direction above.
         kind: one of `SEW_KINDS`.
 
     Returns:
@@ -180,12 +181,11 @@ def sew_angle(robot: Robot, kind: str) -> ca.Function:
         RobotError: if the robot is not a chain of seven revolute joints, or neighbouring axes are parallel.
 
     Source:
-        Both angles and their singularities: [EW2024], for axes that meet in S and W. The choice of E (the foot of the
-        common normal of axes 3 and 4), of S and W elsewhere, and of e_r = -x is ours, and so is the conventional angle
-        as the case e_t = 0.
+        Both angles and their singularities: [EW2024], for axes that intersect in S and W. Ours are: E as the foot of
+        the common normal of axes 3 and 4, S and W for other arms, e_r = -x, and the conventional angle as the case e_t
+        = 0.
     """
     require_known("SEW angle", kind, SEW_KINDS)
-    # A chain of seven revolute joints.
     tree = robot.tree
     tree.require_no_mimics("a shoulder-elbow-wrist angle")
     if tree.n != 7:
@@ -197,9 +197,9 @@ def sew_angle(robot: Robot, kind: str) -> ca.Function:
             raise RobotError(f"joint '{name}' does not follow joint '{tree.joint_names[i - 1]}', expected a chain")
     q = ca.SX.sym("q", robot.n)
     poses = build_body_poses(tree, q)
-    # Each point lies on a joint's axis, the z of its body, at a height above the body's origin that does not depend on
-    # q, because neighbouring axes are fixed to each other. Where axes 1, 2 and 3 meet, S is fixed in the base and in
-    # bodies 1 to 3, so it is a point of axis 1; where axes 5 and 6 meet, W is one of axis 5.
+    # Each point lies on a joint's axis, at a height above the origin of the joint's body. The height does not depend on
+    # q, because neighbouring axes are fixed to each other. If axes 1, 2 and 3 intersect, S is fixed in the base and in
+    # bodies 1 to 3, so it is a point of axis 1. If axes 5 and 6 intersect, W is a point of axis 5.
     shoulder, on_2, gap_12 = _find_common_normal(tree, 0)
     also_on_2, _, gap_23 = _find_common_normal(tree, 1)
     elbow = _find_common_normal(tree, 2)[1]
@@ -216,7 +216,7 @@ def sew_angle(robot: Robot, kind: str) -> ca.Function:
 
 
 def compute_elbow_angle(p_SE: ca.SX, p_SW: ca.SX, e_t: ca.SX, e_r: ca.SX) -> ca.SX:
-    """psi of columns (3, 1). atan2 needs no unit k_x."""
+    """psi from columns (3, 1); k_x need not have unit length."""
     e_SW = p_SW / ca.norm_2(p_SW)
     k_r = ca.cross(e_SW - e_t, e_r)
     k_x = ca.cross(k_r, p_SW)
@@ -224,10 +224,10 @@ def compute_elbow_angle(p_SE: ca.SX, p_SW: ca.SX, e_t: ca.SX, e_r: ca.SX) -> ca.
 
 
 def _find_common_normal(tree: KinematicTree, i: int) -> tuple[float, float, float]:
-    """Ends of the common normal of axes i and i + 1, as heights on the two axes, and its length [m]."""
-    # of joint i + 1 in body i, whose axis is z
+    """The common normal of axes i and i + 1: heights of its ends on the two axes, and its length [m]."""
+    # Origin and axis of joint i + 1 in body i, whose own axis is z.
     origin, axis = tree.translations[i + 1], tree.rotations[i + 1][:, 2]
-    # Seen along the first axis, the foot on the second one is where that line is nearest to the origin.
+    # In a view along the first axis, the foot on the second one is its nearest point to the origin.
     across = axis[:2]
     if np.linalg.norm(across) < RULES.parallel:
         names = tree.joint_names
@@ -243,7 +243,7 @@ def _find_common_normal(tree: KinematicTree, i: int) -> tuple[float, float, floa
 class SEW:
     """xi(q) = psi(q), the rotation of the elbow about the line from shoulder to wrist [EW2024].
 
-    It is a baseline: it describes the self-motion well, but its gradient is not orthogonal to that of the task.
+    It is a baseline. It describes the self-motion well, but its gradient is not orthogonal to those of the task.
 
     Args:
         kind: "conventional" or "stereographic"; see `orthocas.bases.given.sew_angle`.
@@ -265,14 +265,14 @@ class SEW:
 
         Raises:
             InvalidValueError: if the degree of redundancy is not 1.
-            RobotError: if the arm has no shoulder, elbow and wrist.
+            RobotError: if the arm is not a suitable chain; see `sew_angle`.
         """
         if problem.r != 1:
             raise InvalidValueError("r", problem.r, "1 for one SEW angle: use a pose task and a 7-joint arm")
         return Given.from_function(self.label, problem.n, sew_angle(problem.robot, self.kind))
 
     def closed_form(self, problem: Problem) -> ClosedForm:
-        """There are no parameters."""
+        """No parameters."""
         return self.for_problem(problem).closed_form(problem)
 
     def family(self, space: JointSpace, outputs: int) -> GivenFamily:
@@ -281,4 +281,4 @@ class SEW:
         Raises:
             InvalidValueError: always, because the angle depends on the robot.
         """
-        raise InvalidValueError("parametrisation", self.label, "the angle of a robot: for_problem(problem)")
+        raise InvalidValueError("parametrisation", self.label, "the angle of a robot, from for_problem(problem)")

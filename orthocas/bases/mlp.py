@@ -28,12 +28,12 @@ if TYPE_CHECKING:
     from orthocas.tasks.problem import Problem
 
 
-#: What a hidden layer makes of its sums z: tanh z, or the inverse square root unit, z / sqrt(1 + z^2)
+#: activation a(z) of a hidden layer: tanh z, or the inverse square root unit z / sqrt(1 + z^2)
 ACTIVATIONS = ("tanh", "isru")
 
 
 def activate(name: str, z: Expression) -> tuple[Expression, Expression]:
-    """The value a(z) of an activation, and its slope da/dz: 1 - tanh^2 z, or (1 + z^2)^(-3/2)."""
+    """The value a(z) of an activation and its slope da/dz: 1 - tanh^2 z, or (1 + z^2)^(-3/2)."""
     if name == "tanh":
         value = ca.tanh(z)
         return value, 1 - value**2
@@ -42,7 +42,7 @@ def activate(name: str, z: Expression) -> tuple[Expression, Expression]:
 
 
 def _activate_in_place(name: str, z: Array, slope: Array, bend: Array) -> None:
-    """The same of arrays, with a(z) in the place of z, and the bend d log(da/dz)/dz: -2 a, or -3 z / (1 + z^2)."""
+    """Overwrite z with a(z), and compute the slope and the bend d log(da/dz)/dz, which is -2 a or -3 z / (1 + z^2)."""
     if name == "tanh":
         np.tanh(z, out=z)
         np.multiply(z, z, out=slope)
@@ -53,7 +53,7 @@ def _activate_in_place(name: str, z: Array, slope: Array, bend: Array) -> None:
     bend += 1
     np.reciprocal(bend, out=bend)
     np.sqrt(bend, out=slope)
-    # both arrays are on their way: bend is 1 / (1 + z^2), slope its root
+    # At this point bend = 1 / (1 + z^2), and slope is its square root.
     z *= slope
     slope *= bend
     np.sqrt(bend, out=bend)
@@ -62,19 +62,19 @@ def _activate_in_place(name: str, z: Array, slope: Array, bend: Array) -> None:
 
 
 class NetworkArrays:
-    """The gradients of a network at samples, and the derivative of a loss of these gradients.
+    """Computes the gradients of a network at samples, and the derivative of a loss of these gradients.
 
-    With a_l = a(V_l^T a_(l-1) + b_l) and its slopes s_l, the gradient of an output passes from the last layer to the
-    inputs as g_(l-1) = V_l h_l, h_l = s_l g_l. The derivative of a loss goes back: first from the inputs to the
-    outputs along the h_l, then from the outputs to the inputs along the a_l. Both parts of dL/dV_l are one product,
-    [dL/dg_(l-1), a_(l-1)]^T [h_l, dL/dz_l] with z_l = V_l^T a_(l-1) + b_l. So these arrays (r + 1, N, width) have one
-    place more than there are outputs.
+    With a_l = a(V_l^T a_(l-1) + b_l) and slopes s_l, the gradient of an output passes from the last layer to the inputs
+    as g_(l-1) = V_l h_l, h_l = s_l g_l. The derivative of a loss passes back: first from the inputs to the outputs
+    along the h_l, then from the outputs to the inputs along the a_l. One product gives both parts of dL/dV_l,
+    [dL/dg_(l-1), a_(l-1)]^T [h_l, dL/dz_l] with z_l = V_l^T a_(l-1) + b_l. Therefore the arrays (r + 1, N, width) have
+    one more entry than there are outputs.
 
     Args:
         theta: V_1, b_1, ..., V_out, b_out, with V_l (width, next width) row by row. All products have its type.
-        family: the widths of its layers, and their activation.
+        family: the network, for its layers and activation.
         inputs: a_0, (N, inputs).
-        memory: the arrays of earlier networks.
+        memory: reused arrays.
     """
 
     def __init__(self, theta: Array, family: MLPFamily, inputs: Array, memory: ArrayMemory) -> None:
@@ -85,7 +85,7 @@ class NetworkArrays:
         def arrays(name: str, *before: int) -> list[Array]:
             return [memory.array(f"{name}{k}", (*before, N, w), theta.dtype) for k, w in enumerate(widths[:-1])]
 
-        # Values of the layers lie in the last place of `up`, slopes and bends beside them.
+        # The last entry of `up` holds the values a_l of the layers.
         self._up, self._below = arrays("up", widths[-1] + 1), arrays("below", widths[-1] + 1)
         self._s, self._bend, self._work = arrays("slope"), arrays("bend"), arrays("work")
         self._a = [array[-1] for array in self._up]
@@ -97,7 +97,6 @@ class NetworkArrays:
 
     def gradients(self) -> Array:
         """Gradients of the outputs with respect to the inputs, (r, N, inputs)."""
-        # From the last layer to the inputs.
         *hidden, last = self._V
         np.multiply(last.T[:, None, :], self._s[-1], out=self._below[-1][:-1])
         for k in reversed(range(len(hidden))):
@@ -117,7 +116,7 @@ class NetworkArrays:
         self._up[0][:-1] = slopes
         for k, V in enumerate(self._V[:-1], start=1):
             up, h = self._up[k][:-1], self._below[k][:-1]
-            # By h, then by s, times s.
+            # dL/dg_k from dL/dh_k; its product with h sums the derivatives by the slopes.
             np.matmul(_flatten(self._up[k - 1][:-1]), V, out=_flatten(up))
             np.einsum("rsw,rsw->sw", up, h, out=self._work[k])
             up *= self._s[k]
@@ -126,7 +125,7 @@ class NetworkArrays:
         for k in reversed(range(1, len(self._V))):
             by_z, rest = self._below[k][-1], self._work[k]
             rest *= self._bend[k]
-            # By a, then through the activation, and what s adds.
+            # dL/dz_k: through the next layer and the activation, plus the part through the slopes.
             if k < len(self._V) - 1:
                 np.matmul(self._below[k + 1][-1], self._V[k].T, out=by_z)
                 by_z *= self._s[k]
@@ -139,7 +138,7 @@ class NetworkArrays:
 
 
 def _flatten(stack: Array) -> Array:
-    """(r, N, width) as (r N, width)."""
+    """Reshape (r, N, width) to (r N, width)."""
     return stack.reshape(-1, stack.shape[2])
 
 
@@ -160,13 +159,13 @@ class MLP:
 
     Args:
         hidden: widths of the hidden layers, each >= 1.
-        raw: whether revolute joints enter as q itself, too. Coordinates are then not periodic. The number of parameters
-            that the paper states for its network in Sec. 9 is that of raw inputs.
-        cyclic: joints that do not enter the network, but appear in one linear term each, by name, or "auto" for all
-            cyclic joints of the problem; see `Polynomial`.
+        raw: whether revolute joints enter as q itself too, so that coordinates are not periodic. The paper's number of
+            parameters in Sec. 9 is that of raw inputs.
+        cyclic: names of joints with one linear term each instead of an input, or "auto" for all cyclic joints of the
+            problem; see `Polynomial`.
         without: names of joints that coordinates do not depend on; see `Polynomial`.
         activation: a, "tanh" as in the paper, or "isru", a(z) = z / sqrt(1 + z^2), the inverse square root unit
-            (Carlile et al., arXiv:1710.09967). It fits wide charts as well, and takes less time in C.
+            (Carlile et al., arXiv:1710.09967). "isru" fits wide charts equally well, and is faster in C.
 
     Example:
         >>> import orthocas as oc
@@ -186,7 +185,7 @@ class MLP:
 
     hidden: tuple[int, ...] = (64, 64)
     raw: bool = False
-    # others keep their fingerprints
+    # Charts without these settings keep their fingerprints.
     cyclic: Cyclic = field(default=(), metadata={"stored": "if given"})
     without: tuple[str, ...] = field(default=(), metadata={"stored": "if given"})
     activation: str = field(default="tanh", metadata={"stored": "if given"})
@@ -205,13 +204,13 @@ class MLP:
 
     @property
     def label(self) -> str:
-        """'mlp:WIDTHxWIDTH', ':raw' for raw inputs, ':isru', and the joints that enter in another way."""
+        """'mlp:WIDTHxWIDTH', then ':raw', ':isru', and the cyclic and excluded joints, if any."""
         widths = "x".join(map(str, self.hidden)) + (":raw" if self.raw else "")
         widths += "" if self.activation == "tanh" else f":{self.activation}"
         return f"mlp:{widths}{suffix(self.cyclic, self.without)}"
 
     def for_problem(self, problem: Problem) -> MLP:
-        """The parametrisation with the names of the problem's cyclic joints, if it reduces any."""
+        """The parametrisation with `cyclic="auto"` replaced by the names of the problem's cyclic joints."""
         return replace(self, cyclic=resolved(self.cyclic, problem)) if self.cyclic else self
 
     def family(self, space: JointSpace, outputs: int) -> MLPFamily:
@@ -224,7 +223,11 @@ class MLP:
         without = indices(self.without, space)
         inputs = tuple(i for i in range(space.n) if i not in (*linear, *without))
         if not inputs:
-            raise InvalidValueError("cyclic and without", self.label, "at least one joint that enters the network")
+            raise InvalidValueError(
+                "parametrisation",
+                self.label,
+                "at least one joint neither in cyclic nor in without, as an input of the network",
+            )
         return MLPFamily(space, outputs, self.hidden, self.raw, inputs, linear, self.activation)
 
 
@@ -291,10 +294,10 @@ class MLPFamily:
         return xi
 
     def jacobian(self, q: Expression, theta: Expression) -> list[Expression]:
-        """Gradients of the components, r matrices (n, N), by the chain rule from the outputs to the inputs.
+        """Gradients of the components, r matrices (n, N), by the chain rule from outputs to inputs.
 
-        The gradients of all components pass through the layers side by side, as one matrix (width, r N), because BLAS
-        is fast at large products.
+        The gradients of all components pass through the layers in one matrix (width, r N), because BLAS is efficient on
+        large products.
         """
         layers = self._split(theta)
         slopes = self._forward(q, layers)[1]
@@ -303,13 +306,13 @@ class MLPFamily:
         gradients = ca.horzcat(*(ca.repmat(W_out[j, :].T, 1, N) for j in range(r)))
         for (W, _), slope in zip(layers[-2::-1], reversed(slopes), strict=True):
             gradients *= ca.repmat(slope, 1, r)
-            # One sample as rows: then generated C needs no transposed copy of the weights.
+            # A single sample is a row, so that generated C needs no transposed copy of the weights.
             gradients = (gradients.T @ W).T if N == 1 else W.T @ gradients
         turning: list[int] = self.turning
         t = len(turning)
         by_angle = gradients[:t, :] * ca.repmat(ca.cos(q[turning, :]), 1, r)
         by_angle -= gradients[t : 2 * t, :] * ca.repmat(ca.sin(q[turning, :]), 1, r)
-        # Rows of the network's joints, of linear ones, and of those that coordinates do not depend on.
+        # Rows of network joints, of linear joints, and of excluded joints.
         parts = [by_angle, gradients[2 * t :, :]]
         if self.linear:
             A = ca.reshape(theta[self._network_size :], r, len(self.linear))
@@ -318,26 +321,26 @@ class MLPFamily:
         without: list[int] = [i for i in range(self.space.n) if i not in entered]
         if without:
             parts.append(type(q).zeros(len(without), r * N))
-        # Back to the order of the joints.
+        # Restore the order of the joints.
         stacked = ca.vertcat(*parts)[np.argsort([*entered, *without]).tolist(), :]
         return [stacked[:, j * N : (j + 1) * N] for j in range(r)]
 
     def pullback(self, points: Array, theta: Array, memory: ArrayMemory | None = None) -> tuple[Array, Pulled]:
         """J_xi at points (N, n), (N, r, n), and the map from dL/dJ_xi to dL/dtheta; see `ArrayFamily`."""
         turning, direct, linear, size = self.turning, self.direct, list(self.linear), self._network_size
-        # sines and cosines of turning joints, and other joints as they are
+        # Sines and cosines of turning joints, and the other joints unchanged.
         angles, t = points[:, turning], len(turning)
         sin, cos = np.sin(angles).astype(theta.dtype), np.cos(angles).astype(theta.dtype)
         inputs = np.concatenate([sin, cos, points[:, direct].astype(theta.dtype)], axis=1)
         network = NetworkArrays(theta[:size], self, inputs, memory or ArrayMemory())
-        # From the inputs, (N, r, inputs), to the joints.
+        # Chain rule from the network's inputs, (N, r, inputs), to the joints.
         g = network.gradients().transpose(1, 0, 2)
         J = np.zeros((len(points), self.outputs, self.space.n))
         J[:, :, turning] = g[:, :, :t] * cos[:, None] - g[:, :, t : 2 * t] * sin[:, None]
         J[:, :, direct] = g[:, :, 2 * t :]
         J[:, :, linear] = self.split_slopes(theta)
 
-        # the same chain backwards
+        # The same chain rule, backwards.
         def back(slopes: Array, result: Array) -> Array:
             by_angle, by_direct = slopes[:, :, turning].astype(theta.dtype), slopes[:, :, direct].astype(theta.dtype)
             parts = [by_angle * cos[:, None], -by_angle * sin[:, None], by_direct]
@@ -351,7 +354,7 @@ class MLPFamily:
         self, q: Expression, layers: list[tuple[Expression, Expression]]
     ) -> tuple[Expression, list[Expression]]:
         """Outputs of the network (r, N), and the slopes of the hidden layers, (width, N) each."""
-        # The network takes sines and cosines of joints that turn, and others as they are.
+        # Inputs: sines and cosines of turning joints, and the other joints unchanged.
         angles = q[self.turning, :]
         layer = ca.vertcat(ca.sin(angles), ca.cos(angles), q[self.direct, :])
         slopes = []
@@ -373,12 +376,12 @@ class MLPFamily:
 
     def reordered(self, theta: Array, order: Sequence[int]) -> Array:
         """Parameters with the outputs in another order, (size,)."""
-        # The products with 0 and 1 are exact.
+        # Multiplications by 0 and 1 are exact.
         return self.combined(theta, np.eye(self.outputs)[list(order)])
 
     def combined(self, theta: Array, B: Array) -> Array:
         """Parameters of B xi, (size,), for a matrix B (r, r)."""
-        # W_out column by column, then b_out, then A.
+        # The last parameters are W_out column by column, b_out, and A.
         last = self.outputs * (self.widths[-2] + 1 + len(self.linear))
         columns = theta[-last:].reshape(-1, self.outputs) @ B.T
         return np.concatenate([theta[:-last], columns.ravel()])

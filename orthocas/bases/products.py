@@ -19,19 +19,19 @@ from orthocas.tasks.problem import Problem
 from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, freeze_array, require_count, require_known
 
-JOINTS = "joints"  #: names the most joints of a product in labels
-Term = tuple[int, ...]  #: index of the one-joint function of every joint; 0 is the constant 1
+JOINTS = "joints"  #: word in labels for the largest number of joints in a product
+Term = tuple[int, ...]  #: for each joint, the index of its one-joint function; 0 is the constant 1
 
 
 @dataclass(frozen=True, eq=False, kw_only=True)
 class ProductFamily(BasisFamily):
     """psi_k(q) = prod_i f_i,k_i(q_i) over the joints. Use `build_product_family` to build one.
 
-    Derivatives of terms are sums of terms. So with each term, the family contains the terms of its derivatives.
+    Derivatives of terms are sums of terms. So for each term, the family also contains the terms of its derivatives.
     """
 
     terms: tuple[Term, ...]
-    one_joint_derivatives: Callable[[int], Array]  #: D of joint i, with f_i,a' = sum_b D_ab f_i,b
+    one_joint_derivatives: Callable[[int], Array]  #: joint i -> D with f_i,a' = sum_b D_ab f_i,b
 
     @property
     def width(self) -> int:
@@ -54,7 +54,7 @@ class ProductFamily(BasisFamily):
     @cached_property
     def derivatives(self) -> list[tuple[Array, NDArray[np.int_], NDArray[np.int_]]]:
         """Entries of D_i with d (1, psi) / d q_i = D_i (1, psi): values, rows and columns for every joint."""
-        # Each derivative of a term is a sum of terms with another function of that joint.
+        # The derivative of a term replaces one factor, so it is a sum of terms.
         terms = ((0,) * self.space.n, *self.terms)
         places = {term: k for k, term in enumerate(terms)}
         found = []
@@ -91,7 +91,7 @@ def build_product_family(
     one_joint_functions: Callable[[Any], list[Any]],
     one_joint_derivatives: Callable[[int], Array],
 ) -> ProductFamily:
-    """The family of the given terms.
+    """Build the family of the given terms.
 
     Args:
         space: the joints.
@@ -102,11 +102,12 @@ def build_product_family(
     """
 
     def basis(q: Any) -> Any:
-        # the terms and what they are made of, by the number of their factors
+        # The terms and their leading parts, grouped by number of factors.
         by_factors: dict[int, list[Term]] = {}
         for term in sorted(with_parts(terms)):
             by_factors.setdefault(len(term) - term.count(0), []).append(term)
-        # all terms with as many factors are one product of columns: one by one takes CasADi ten times as long
+        # Compute all terms with equally many factors in one product of columns. One by one, CasADi takes ten times as
+        # long.
         factors, n = ca.vertcat(*one_joint_functions(q)), len(terms[0])
         levels: list[Any] = []
         rows: list[dict[Term, int]] = []
@@ -122,7 +123,7 @@ def build_product_family(
 
 
 def with_parts(terms: Iterable[Term]) -> set[Term]:
-    """The terms, and what is left of each without its last factors."""
+    """The terms, and the shorter products that remain after removing last factors."""
     found: set[Term] = set()
     waiting = list(terms)
     while waiting:
@@ -144,7 +145,7 @@ def split(term: Term) -> tuple[Term, int, int]:
 def reduce_terms(
     degrees: list[list[int]], total: int, linear: list[int], joints: int | None = None
 ) -> tuple[Term, ...]:
-    """The terms of `list_terms` without those in the joints `linear`, then the term linear in each of these."""
+    """Terms of `list_terms` without the joints `linear`, then a linear term for each of these joints."""
     kept = [[0] if k in linear else own for k, own in enumerate(degrees)]
     return (*list_terms(kept, total, joints), *(tuple(int(i == k) for i in range(len(degrees))) for k in linear))
 
@@ -155,7 +156,7 @@ def list_terms(degrees: list[list[int]], total: int, joints: int | None = None) 
     Args:
         degrees: the degrees of the functions of every joint. The first is 0.
         total: largest sum of degrees.
-        joints: most joints with another function than the constant. Default: all.
+        joints: largest number of joints in a term. Default: all.
     """
 
     def extend(prefix: Term, left: int, others: int) -> Iterator[Term]:
@@ -163,7 +164,7 @@ def list_terms(degrees: list[list[int]], total: int, joints: int | None = None) 
             if any(prefix):
                 yield prefix
             return
-        # joint by joint, with what is left of the degree and of the number of factors
+        # Go joint by joint, with the remaining degree and number of factors.
         for k, degree in enumerate(degrees[len(prefix)]):
             if degree <= left and (others or not k):
                 yield from extend((*prefix, k), left - degree, others - (k > 0))
@@ -173,11 +174,11 @@ def list_terms(degrees: list[list[int]], total: int, joints: int | None = None) 
 
 @dataclass(frozen=True)
 class Products:
-    """What products of one-joint functions of a total degree have in common; see `Polynomial` and `Fourier`."""
+    """The common part of `Polynomial` and `Fourier`: products of one-joint functions of a total degree."""
 
     degree: int
     cyclic: Cyclic = ()
-    # others keep their fingerprints
+    # Charts without these settings keep their fingerprints.
     joints: int | None = field(default=None, metadata={"stored": "if given"})
     without: tuple[str, ...] = field(default=(), metadata={"stored": "if given"})
     linear = True
@@ -192,7 +193,7 @@ class Products:
             object.__setattr__(self, "joints", require_count("joints", self.joints))
 
     def for_problem(self, problem: Problem) -> Self:
-        """The parametrisation with the names of the problem's cyclic joints, if it reduces any."""
+        """The parametrisation with `cyclic="auto"` replaced by the names of the problem's cyclic joints."""
         return replace(self, cyclic=resolved(self.cyclic, problem)) if self.cyclic else self
 
     def of_degree(self, degree: int) -> Self:
@@ -201,14 +202,14 @@ class Products:
 
     @property
     def _settings(self) -> str:
-        """The label after its name: 'DEGREE', with the most joints of a product and the cyclic joints if given."""
+        """The label after its name: 'DEGREE', with the largest number of joints and the special joints if given."""
         most = "" if self.joints is None else f":{JOINTS}={self.joints}"
         return f"{self.degree}{most}{suffix(self.cyclic, self.without)}"
 
     def _count_terms(self, n: int, functions: int) -> int:
-        """Sum over j of C(n, j) C(d, j) f^j without the constant, for f functions of each degree of a joint."""
+        """Sum over j of C(n, j) C(d, j) f^j without the constant, with f functions per degree and joint."""
         n -= len(self.without)
-        # "auto" counts as none until it is resolved
+        # "auto" counts as no joint until it is resolved.
         linear = 0 if self.cyclic == "auto" else min(n, len(self.cyclic))
         most = min(n - linear, self.degree, self.degree if self.joints is None else self.joints)
         terms: int = sum(comb(n - linear, j) * comb(self.degree, j) * functions**j for j in range(1, most + 1))
@@ -221,12 +222,12 @@ class Polynomial(Products):
 
     Args:
         degree: total degree, >= 1.
-        cyclic: joints that appear in one linear term each, by name, or "auto" for all cyclic joints of the problem.
-            Charts are then valid for all positions of these joints; see `orthocas.bases.cyclic_joints`.
-        joints: most joints in one product, >= 1. Default: all. With 2, terms of three joints and more are left out:
-            that is most of them with many joints, and they gain little.
-        without: names of joints that coordinates do not depend on, such as the last one under a pose: xi then stays
-            while the tool turns about its own axis.
+        cyclic: names of joints with one linear term each, or "auto" for all cyclic joints of the problem. Charts are
+            then valid for all positions of these joints; see `orthocas.bases.cyclic_joints`.
+        joints: largest number of joints in one product, >= 1. Default: all. With 2, terms of three or more joints are
+            left out. For many joints these are most of the terms, and they gain little.
+        without: names of joints that coordinates do not depend on, such as the last joint under a pose: xi then stays
+            the same while the tool turns about its own axis.
 
     Example:
         >>> import orthocas as oc
@@ -245,13 +246,13 @@ class Polynomial(Products):
         return f"polynomial:{self._settings}"
 
     def term_count(self, n: int) -> int:
-        """C(n + d, d) - 1 with all products of n joints that are not cyclic, plus one term for each that is."""
+        """C(n + d, d) - 1 for the n joints that are not cyclic, plus one term per cyclic joint."""
         return self._count_terms(n, 1)
 
     def family(self, space: JointSpace, outputs: int) -> ProductFamily:
         """Polynomials in u_i = (q_i - centre_i) / half_width_i."""
 
-        # Legendre polynomials by their recursion, of length 1 over the domain.
+        # Legendre polynomials by recursion, of length 1 over the domain.
         def legendre(q: Any) -> list[Any]:
             centre, half_width = (ca.repmat(ca.DM(v), 1, q.shape[1]) for v in (space.centre, space.half_width))
             u = (q - centre) / half_width
@@ -261,12 +262,12 @@ class Polynomial(Products):
             return [sqrt(2 * k + 1) * P[k] for k in range(1, self.degree + 1)]
 
         def derivatives(i: int) -> Array:
-            """P_a' = sum of (2 b + 1) P_b over b = a - 1, a - 3, ..., here for normalised polynomials."""
+            """P_a' = sum of (2 b + 1) P_b over b = a - 1, a - 3, ..., converted to normalised polynomials."""
             a, b = np.indices((self.degree + 1, self.degree + 1))
             values: Array = np.sqrt((2 * a + 1) * (2 * b + 1)) * ((a > b) & ((a - b) % 2 == 1)) / space.half_width[i]
             return values
 
-        # Functions that each joint may bring, and their products up to the degree.
+        # Degrees of the functions of each joint, then all products up to the total degree.
         none = indices(self.without, space)
         degrees = [[0] if i in none else list(range(self.degree + 1)) for i in range(space.n)]
         terms = reduce_terms(degrees, self.degree, indices(self.cyclic, space), self.joints)
@@ -279,9 +280,9 @@ class Fourier(Products):
 
     Args:
         degree: total degree, >= 1.
-        cyclic: joints that appear in one linear term each instead of sines and cosines, by name, or "auto" for all
-            cyclic joints of the problem; see `orthocas.bases.cyclic_joints`.
-        joints: most joints in one product, >= 1. Default: all.
+        cyclic: names of joints with one linear term each instead of sines and cosines, or "auto" for all cyclic joints
+            of the problem; see `orthocas.bases.cyclic_joints`.
+        joints: largest number of joints in one product, >= 1. Default: all.
         without: names of joints that coordinates do not depend on.
 
     Example:
@@ -297,7 +298,7 @@ class Fourier(Products):
         return f"fourier:{self._settings}"
 
     def term_count(self, n: int) -> int:
-        """Sum over j of C(n, j) C(d, j) 2^j, without the constant. Cyclic joints do not count in n, but add a term."""
+        """Sum over j of C(n, j) C(d, j) 2^j without the constant, n joints not cyclic; plus one per cyclic joint."""
         return self._count_terms(n, 2)
 
     def family(self, space: JointSpace, outputs: int) -> ProductFamily:
@@ -313,7 +314,7 @@ class Fourier(Products):
             )
         linear = indices(self.cyclic, space)
 
-        # Waves of length 1; a cyclic joint has a linear function in place of its first one.
+        # Waves of length 1; a cyclic joint has a linear function as its first one.
         def waves(q: Any) -> list[Any]:
             out = [sqrt(2) * wave(k * q) for k in range(1, self.degree + 1) for wave in (ca.cos, ca.sin)]
             rows = (q[i, :] - space.centre[i] if i in linear else out[0][i, :] for i in range(space.n))
@@ -328,7 +329,7 @@ class Fourier(Products):
                 D[2 * k - 1, 2 * k], D[2 * k, 2 * k - 1] = -k, k
             return D
 
-        # Functions that each joint may bring, and their products up to the degree.
+        # Degrees of the functions of each joint, then all products up to the total degree.
         none = indices(self.without, space)
         of_joint = [0, *(k for k in range(1, self.degree + 1) for _ in range(2))]
         degrees = [[0] if i in none else of_joint for i in range(space.n)]
@@ -345,8 +346,8 @@ class Linear:
 
     Args:
         base: q0, (n,) [rad] or [m]. Default: the centre of the domain.
-        normals: "orthonormal" for an orthonormal basis of the null space of J_x A^-1, or "paper" for (37) with n = 3,
-            m = 1 and (39) with n = 3, m = 2.
+        normals: "orthonormal" for an orthonormal basis of the null space of J_x A^-1, or "paper" for the vectors of
+            (37) with n = 3, m = 1 and of (39) with n = 3, m = 2.
     """
 
     base: tuple[float, ...] | None = None
@@ -364,11 +365,11 @@ class Linear:
         return "linear"
 
     def for_problem(self, problem: Problem) -> Linear:
-        """The object itself: it does not depend on the problem."""
+        """The same object: it does not depend on the problem."""
         return self
 
     def closed_form(self, problem: Problem) -> ClosedForm:
-        """The normals at the base. The coordinates vanish at the base, and keep their unit normals.
+        """The normals at the base as parameters. The coordinates are zero at the base, and are not rescaled.
 
         Raises:
             ShapeError: if the base does not have n entries.
@@ -400,7 +401,6 @@ class Linear:
             SingularTaskError: if the gradients are linearly dependent at the base.
             InvalidValueError: if normals is "paper" and n is not 3.
         """
-        # The null space of the task's gradients at the base.
         m, n = gradients.shape
         values, vectors = np.linalg.svd(gradients)[1:]
         normals = vectors[m:]
@@ -416,7 +416,9 @@ class Linear:
             return np.asarray(normal / np.linalg.norm(normal), dtype=float)[None, :]
         v = gradients[0]
         if np.hypot(v[0], v[1]) < 1e-9 * np.linalg.norm(v):
-            raise SingularTaskError("the paper's normals (37) need a task gradient with a component along joint 1 or 2")
+            raise SingularTaskError(
+                "the paper's normals (37) require a task gradient with a component along joint 1 or 2"
+            )
         n1 = np.array([v[1], -v[0], 0.0]) / np.hypot(v[0], v[1])  # (37a)
         n2 = np.cross(n1, v)  # (37b)
         return np.array([n1, n2 / np.linalg.norm(n2)])

@@ -1,9 +1,10 @@
-"""Proofs that a chart does not fold and is one-to-one, and their check.
+"""Proofs that a chart does not fold and is one-to-one, and checks of these proofs.
 
-- `certify` proves, and checks proofs; `search` divides the domain, `box_checks` and `one_to_one` prove single boxes.
-- With one coordinate, `determinant` expands det J in waves of the joints, and bounds it.
-- `rows` and `jets` bound rows of the Jacobian and their averages, `outside` what lies beyond a box.
-- `taylor` and `graph` are the arithmetic: Taylor models with remainders that cover rounding.
+- `certify` proves, and checks proofs. `search` divides the domain into boxes, `box_checks` and `one_to_one` prove
+  boxes.
+- `determinant` handles charts with one coordinate: it expands det J in waves of the joints, and bounds it.
+- `rows` and `jets` bound the rows of the Jacobian and their averages; `outside` handles boxes outside the domain.
+- `taylor` and `graph` are the arithmetic: Taylor models whose remainders include rounding.
 """
 
 from orthocas.certificates.certify import certify, check_certificate

@@ -1,4 +1,4 @@
-"""Certify charts: prove with rigorous arithmetic that they do not fold, and where they are one-to-one."""
+"""Certifies charts: proves by rigorous arithmetic that they do not fold, and where they are one-to-one."""
 
 from __future__ import annotations
 
@@ -32,21 +32,22 @@ from orthocas.tools.progress import Monitor, Progress, silent
 class CertifyRules:
     """Numbers of proofs and of their check."""
 
-    samples: int = 20_000  #: points where folds are looked for before the proof
-    scales: int = 51  #: of the domain, for one-to-one boxes
-    shrink: float = 0.95  #: from each of these scales to the next one
-    few_boxes: int = 300  #: for one scale
-    least_boxes: int = 500  #: of the one-to-one proof
+    samples: int = 20_000  #: samples at which folds are searched before the proof
+    scales: int = 51  #: number of scales of the domain that are tried for one-to-one boxes
+    shrink: float = 0.95  #: ratio of consecutive scales
+    few_boxes: int = 300  #: boxes to try for one scale at first
+    least_boxes: int = 500  #: smallest budget of boxes of the one-to-one proof
     most_boxes: int = 45_000
-    held_range: float = 1.0  #: half-width of a leading joint on which J does not depend, if its whole range is too wide
-    guarded_boxes: int = 1_000_000  #: for charts whose domain keeps folds out
-    at_once: int = 512  #: boxes of one task of the check
-    same_fraction: float = 1e-4  #: of the same samples, on machines that round otherwise
-    off_centre: float = 1e-6  #: of the width of a box
+    #: half-width of a leading joint on which J does not depend, if its whole range fails [rad] or [m]
+    held_range: float = 1.0
+    guarded_boxes: int = 1_000_000  #: budget of boxes for charts whose domain excludes folds
+    at_once: int = 512  #: boxes per task of the check
+    same_fraction: float = 1e-4  #: tolerance of sampled fractions between machines that round differently
+    off_centre: float = 1e-6  #: tolerance of the centre of a box, relative to its width
 
 
 RULES = CertifyRules()
-#: boxes of the one-to-one proof, in those that the proof without folds took
+#: budget of the one-to-one proof, as a multiple of the boxes that the proof of no fold took
 _MORE_BOXES = {ELIMINATION: 3, COFACTORS: 30}
 Mapped = Callable[..., Iterable[BoxResults]]
 
@@ -62,37 +63,40 @@ def certify(
 ) -> Certificate:
     """Prove that a chart does not fold: det J has one sign on its domain, and the conditioning is above a bound.
 
-    The domain is halved again and again, until J is proved nonsingular on each part: by Taylor models of degree 3 with
-    remainders that include all rounding, taken to the singular vectors of their centre, and elimination. With one
-    polynomial coordinate and no bound, det J itself is bounded, as one polynomial of degree 5 on each part. The robot's
-    numbers and those of the chart are taken as they are in the file. Samples are no part of the proof; they only find
-    folds early. Also proved is a large box around the centre on which phi is one-to-one: the average of J between any
-    two of its points is nonsingular, see `orthocas.certificates.one_to_one`. It has the domain's proportions, but a
-    joint on which J does not depend keeps its whole range if it can.
+    The domain is halved repeatedly until J is proved nonsingular on each part. The proof uses Taylor models of degree 3
+    whose remainders include all rounding. They are multiplied by the singular vectors of their centre, then eliminated.
+    For one polynomial coordinate without a bound, det J itself is bounded, as one polynomial of degree 5 on each part.
+    The numbers of the robot and of the chart are taken as exact. Samples are not part of the proof; they only find
+    folds early.
 
-    In a `ClearBox`, parts need no proof that are proved, by the same arithmetic, to lie outside: the relative singular
-    value of the task is at most the bound there. They count as proved in the share of the box. So do parts of the box
-    of a `Corridor` that are farther from its path than the radius.
+    A second proof finds a large box around the centre on which phi is one-to-one: the average of J between any two of
+    its points is nonsingular, see `orthocas.certificates.one_to_one`. The box has the proportions of the domain, but a
+    joint on which J does not depend keeps its whole range if possible.
 
-    The domain of a wide chart, a `RegularPart`, leaves out folds itself. There, proved is that its clear box needs no
-    such test: what is not proved is left to the domain, and the search ends after a million boxes.
+    In a `ClearBox`, a part needs no proof if it is proved, by the same arithmetic, to lie outside: the relative
+    singular value of the task is at most the bound there. Such parts count as proved in the share of the box. The same
+    holds for parts of the box of a `Corridor` that are farther from its path than the radius.
+
+    The domain of a wide chart, a `RegularPart`, excludes folds by a test of its own. There the certificate proves where
+    the clear box does not need this test. Parts without a proof rely on the test, and the search ends after a million
+    boxes.
 
     Args:
         chart: a fitted chart.
         bound: bound of the conditioning as in `evaluate`, from 0 (det J != 0 only) to below 1; Euclidean metric only.
-            The condition used is sufficient, and misses 4 to 14 % of the true conditioning.
-        time_limit: seconds after which the certificate holds the share proved so far.
-        executor: shares the work, for example `concurrent.futures.ProcessPoolExecutor`, or
+            The proof uses a sufficient condition, which is 4 to 14 % below the true conditioning.
+        time_limit: seconds after which the search stops. The certificate then holds the share proved so far.
+        executor: distributes the work, for example `concurrent.futures.ProcessPoolExecutor`, or
             `distributed.Client(...).get_executor(pure=False)` of Dask. Default: this process.
-        monitor: called with progress.
-        resume: an unfinished certificate of the same chart and bound, to go on from.
+        monitor: receives progress.
+        resume: an unfinished certificate of the same chart and bound to continue.
 
     Returns:
-        What is proved and what is not. `certificate.proved` is True if everything is.
+        The certificate. `certificate.proved` is True if everything is proved.
 
     Raises:
-        CertifyError: if the chart is grown, uses operations without proven bounds, or `resume` belongs to another one.
-        Interrupted: after Ctrl-C; `result` is the certificate so far.
+        CertifyError: if the chart is grown or uses operations without proven bounds, or `resume` is for another chart.
+        Interrupted: after Ctrl-C; its `result` is the certificate so far.
 
     Example:
         >>> import orthocas as oc
@@ -108,7 +112,7 @@ def certify(
     rows = build_chart_rows(chart)
     base = cover_domain(chart.problem.domain)
     if resume is not None:
-        # Go on with what the earlier search left open, by the same method.
+        # Continue the open parts of the earlier search with the same method.
         require_same(chart, resume)
         if resume.bound != bound or resume.fold:
             raise CertifyError(
@@ -117,7 +121,7 @@ def certify(
         base = resume.regular
     check = choose_check(chart, rows, bound, None if resume is None else resume.method)
     guarded = chart.problem.domain.room_to_fold is not None
-    # Near the boundary of a domain that keeps folds out, there is always something left to prove.
+    # Near the boundary of a domain that excludes folds, some parts always stay open.
     if guarded:
         limits = replace(limits, boxes=RULES.guarded_boxes)
     search = Search(check, base, limits, executor)
@@ -126,7 +130,7 @@ def certify(
     def build_so_far() -> Certificate:
         return _build_certificate(chart, check.method, bound, search, injective, time.monotonic() - start, resume)
 
-    # Look for folds first, then prove all parts, then with the time that is left a box where phi is one-to-one.
+    # First look for folds, then prove all parts. The remaining time is for the one-to-one box.
     try:
         search.visit(_sample_suspects(chart))
         search.run(_report_search(monitor, "regular", guarded=guarded))
@@ -142,19 +146,19 @@ def certify(
 def check_certificate(
     chart: Chart, certificate: Certificate | None = None, *, executor: Executor | None = None, monitor: Monitor = silent
 ) -> bool:
-    """Whether a certificate holds: all that it says of the chart is computed once more.
+    """Check a certificate by repeating all its proofs.
 
-    That is each part of the domain, the bound of the conditioning, the two signs of a fold, and the one-to-one box. The
-    number of boxes that were evaluated and the seconds are history, which only the digest of the certificate covers.
+    These are the proof of each part of the domain, the bound of the conditioning, the two signs of a fold, and the
+    one-to-one box. The number of evaluated boxes and the seconds are not repeated; only the digest protects them.
 
     Args:
         chart: the chart.
         certificate: its certificate. Default: the one in the chart's file.
-        executor: shares the work, see `certify`.
+        executor: distributes the work, see `certify`.
         monitor: called with progress.
 
     Raises:
-        CertifyError: if there is no certificate, if it belongs to another chart or method or has been changed, or if
+        CertifyError: if there is no certificate, if it belongs to another chart or method or was changed, or if
             `certify` would refuse the chart.
 
     Example:
@@ -165,24 +169,24 @@ def check_certificate(
         >>> check_certificate(chart, oc.certify(chart))
         True
     """
-    # The certificate must be one of this chart before any number of it is checked.
+    # Make sure that the certificate belongs to this chart before its numbers are used.
     check_options(chart, None, executor)
     certificate = chart.certificate if certificate is None else certificate
     if certificate is None:
         raise CertifyError("the chart has no certificate, expected one made by `certify`")
     require_same(chart, certificate)
-    # All parts are checked as they were proved, by the same method.
+    # Repeat the proofs of all parts with the method that made them.
     bound, rows = check_bound(chart, certificate.bound), build_chart_rows(chart)
     check = choose_check(chart, rows, bound, certificate.method)
     mapped: Mapped = map if executor is None else partial(in_order, executor)
     domain, whole = chart.problem.domain, certificate.regular
-    # A fold is two points of the domain at which det J is proved to have opposite signs.
+    # A fold is proved by two points of the domain at which det J has opposite signs.
     if certificate.fold:
         points = np.array(certificate.fold)
         ends = check(points, points)
         if not (domain.contains(points).all() and ends.regular.all() and ends.sign.prod() < 0):
             return False
-    # The parts are proved, with one sign unless the chart folds, and their bounds are what the certificate says.
+    # All parts must be proved, with one sign unless the chart folds, and with the bounds that the certificate states.
     parts = _check_parts(check, whole, mapped, monitor)
     signs = {int(sign) for results in parts for sign in np.unique(results.sign) if sign}
     least = min((float(results.conditioning.min()) for results in parts), default=0.0)
@@ -191,7 +195,7 @@ def check_certificate(
         return False
     if abs(_estimate_proved_fraction(domain, whole) - certificate.clear_share) > RULES.same_fraction:
         return False
-    # The one-to-one box has its own check, and must lie in the domain, around its centre.
+    # The one-to-one box has its own check. It must lie in the domain, around its centre.
     box = certificate.injective
     if box is None:
         return True
@@ -204,7 +208,7 @@ def check_certificate(
 
 
 def check_options(chart: Chart, time_limit: float | None, executor: Executor | None) -> float:
-    """Seconds of a time limit, inf for none. Chart and executor are checked as well."""
+    """Check chart, time limit and executor; returns the limit in seconds, inf for none."""
     require_kind("chart", chart, Chart)
     require_driven("a certificate", chart.problem.robot.tree)
     require_executor(executor)
@@ -214,11 +218,11 @@ def check_options(chart: Chart, time_limit: float | None, executor: Executor | N
 
 
 def check_bound(chart: Chart, bound: float) -> float:
-    """A bound of the conditioning, checked."""
+    """Check and return a bound of the conditioning."""
     bound = as_number("bound", bound)
     if not 0 <= bound < 1:
         raise InvalidValueError("bound", bound, "a number from 0 to below 1")
-    # Bounds above 0 need a fixed base and the Euclidean metric.
+    # Bounds above 0 require a fixed base and the Euclidean metric.
     if bound > 0 and build_chart_rows(chart).base:
         raise CertifyError(f"bound is {bound:g} on a moving base, expected 0: the sign of det J is proved there")
     if bound > 0 and not chart.problem.metric.is_identity:
@@ -230,9 +234,9 @@ def check_bound(chart: Chart, bound: float) -> float:
 
 
 def cover_domain(domain: Domain) -> Subdivision:
-    """The domain, with the slack of its boundaries, as a box in one part; unbounded joints have their half-width.
+    """The domain as a box of one part, widened by its tolerance; unbounded joints have their half-width.
 
-    That of a full turn is pi, rounded down. With the slack, the box holds every angle.
+    The half-width of a full turn is pi, rounded down. With the tolerance, the box contains every angle.
     """
     half = domain.reach
     half = np.where(np.isfinite(half), half, domain.half_width + domain.slack)
@@ -241,7 +245,7 @@ def cover_domain(domain: Domain) -> Subdivision:
 
 
 def require_same(chart: Chart, certificate: Certificate) -> None:
-    """Raise CertifyError unless a certificate is one of this chart and of this version's method."""
+    """Raise CertifyError unless the certificate belongs to this chart and to this version's method."""
     require_kind("certificate", certificate, Certificate)
     if certificate.method not in METHODS:
         expected = " or ".join(METHODS)
@@ -249,15 +253,16 @@ def require_same(chart: Chart, certificate: Certificate) -> None:
     certificate.require_for(fingerprint(chart.problem, chart.coordinates))
     if not certificate.digest:
         raise CertifyError("the certificate has no digest, expected one made by `certify`")
-    # It holds only for the domain that it was made for, with the same bounds on singular values and folds.
+    # A certificate is valid only for the domain that it was made for, with the same bounds on singular values and
+    # folds.
     left_out = getattr(chart.problem.domain, "least_singular_value", 0.0)
     if certificate.least_singular_value != left_out:
         raise CertifyError(
-            f"the certificate is void: it leaves out singular values up to {certificate.least_singular_value:g}, "
+            f"the certificate is void: its domain excludes singular values up to {certificate.least_singular_value:g}, "
             f"the domain {left_out:g}"
         )
     if certificate.least_volume != getattr(chart.problem.domain, "least_volume", 0.0):
-        raise CertifyError("the certificate is void: the domain keeps out folds by another volume")
+        raise CertifyError("the certificate is void: the domain now excludes folds by another bound on the volume")
     domain = cover_domain(chart.problem.domain)
     if not (
         np.array_equal(domain.low, certificate.regular.low) and np.array_equal(domain.high, certificate.regular.high)
@@ -266,9 +271,9 @@ def require_same(chart: Chart, certificate: Certificate) -> None:
 
 
 def _sample_suspects(chart: Chart) -> Array:
-    """Two suspects: the home, and the sample with the least sign(det J(home)) det J, of three kinds of samples."""
+    """Two suspected points of a fold: the home, and the sample with the least det J relative to the sign at home."""
     domain = chart.problem.domain
-    # Powers of uniform samples lie near faces and corners.
+    # Powers of uniform samples are nearer to faces and corners.
     rng = np.random.default_rng(0)
     unit = rng.uniform(-1, 1, (RULES.samples, chart.n))
     powers = rng.choice([1.0, 0.5, 0.25], (RULES.samples, 1))
@@ -276,7 +281,7 @@ def _sample_suspects(chart: Chart) -> Array:
     points = points[domain.contains(points)]
     if domain.draws_itself:
         points = sample_boundary_weighted(domain, RULES.samples, 0)
-    # det J of the samples, relative to its sign at the home.
+    # det J at the samples, relative to its sign at the home.
     J_x = chart.problem.task.batched_jacobian(points)[0].reshape(-1, chart.m, chart.n)
     volumes = np.linalg.det(np.nan_to_num(np.concatenate([J_x, chart.coordinates.jacobian(points)], axis=1)))
     worst = int(np.argmin(volumes * np.sign(volumes[0])))
@@ -286,10 +291,10 @@ def _sample_suspects(chart: Chart) -> Array:
 def _find_one_to_one_box(
     chart: Chart, rows: ChartRows, base: Subdivision, limits: Limits, executor: Executor | None, monitor: Monitor
 ) -> Subdivision | None:
-    """The largest of some boxes around the centre with a proof, and its parts; None if there is no proof for any.
+    """The largest box around the centre with a proof, and its parts; None if no box has a proof.
 
-    Leading joints on which J does not depend keep their whole range, or 1 rad. A few boxes are enough for most scales;
-    from there, larger ones are tried with more, until one of them would take too many.
+    Leading joints on which J does not depend keep their whole range, or 1 rad. Most scales get a small budget of boxes.
+    Then larger scales get more, until one exceeds the budget.
     """
     end = time.monotonic() + limits.seconds
     best: Subdivision | None = None
@@ -299,13 +304,13 @@ def _find_one_to_one_box(
 
     def prove(fraction: Array, most: int) -> bool:
         nonlocal best
-        # A box about the same centre, with so much of the width of each joint.
+        # A box about the same centre, with this fraction of each width, except for leading joints.
         centre, whole = (base.low + base.high) / 2, fraction == 1
         reach = fraction * half
         low, high = np.where(whole, base.low, centre - reach), np.where(whole, base.high, centre + reach)
         part = Subdivision.whole(low, high)
         point, own = (part.low + part.high)[None] / 2, replace(check, low=part.low, high=part.high)
-        # At the centre of the box, the two points may be farthest apart.
+        # First try the centre, where two points of the box can be farthest apart.
         if not own(point, point).proved.all():
             return False
         left = Limits(max(end - time.monotonic(), 0.0), boxes=most, hopeless=most // 4)
@@ -317,7 +322,7 @@ def _find_one_to_one_box(
 
     joints = np.arange(chart.n)
     scales = [RULES.shrink**k for k in range(RULES.scales - 1, -1, -1)]
-    # Idle joints are coordinates themselves: their range does not matter.
+    # Idle joints are coordinates themselves, so their range is arbitrary.
     idle = ~np.isin(joints, rows.active)
     held, half = np.isin(joints, check.still_joints), (base.high - base.low) / 2
     for range_ in (np.inf, RULES.held_range) if held.any() else (np.inf,):
@@ -329,10 +334,10 @@ def _find_one_to_one_box(
 
 
 def _try_scales(boxes: Sequence[Array], prove: Callable[[Array, int], bool], most: int) -> None:
-    """Ask for proofs of boxes of increasing size: the largest one, then by bisection with few boxes, then with many."""
+    """Find the largest box with a proof: the largest one, then bisection with a small budget, then larger budgets."""
     if prove(boxes[-1], RULES.few_boxes):
         return
-    # Those before `low` are proved, those from `high` on are not with few boxes.
+    # Boxes before `low` are proved; boxes from `high` on are not, with the small budget.
     low, high = 0, len(boxes) - 1
     while low < high:
         half_way = (low + high) // 2
@@ -355,7 +360,7 @@ def _build_certificate(
     resume: Certificate | None,
 ) -> Certificate:
     fold = tuple(tuple(point.tolist()) for point in search.signs.values()) if search.folded else ()
-    # What an earlier search took and proved counts as well.
+    # Add the boxes and the bounds of an earlier search.
     boxes, conditioning = search.evaluated, search.conditioning
     if resume is not None:
         boxes, seconds = boxes + resume.boxes, seconds + resume.seconds
@@ -379,9 +384,9 @@ def _build_certificate(
 
 
 def _estimate_proved_fraction(domain: Domain, parts: Subdivision) -> float:
-    """Of all clear positions in the box of a domain that keeps folds out, the share in proved parts; 0 for others.
+    """Fraction of the clear positions in proved parts, for a domain that excludes folds; 0 for other domains.
 
-    From samples of the box, and of the parts that are not proved.
+    It is estimated from samples of the box, and of the parts that are not proved.
     """
     bound = domain.singular_bound
     if bound is None or domain.room_to_fold is None:
@@ -391,27 +396,27 @@ def _estimate_proved_fraction(domain: Domain, parts: Subdivision) -> float:
         return 1.0
     rng, volumes = np.random.default_rng(0), (high - low).prod(axis=1)
 
-    # The fraction of positions between corners whose relative singular value is above the bound.
+    # Fraction of positions between corners whose relative singular value is above the bound.
     def measure_clear(low: Array, high: Array) -> float:
         values = bound.singular_values(rng.uniform(low, high, (RULES.samples, parts.n)))
         return float(np.mean(values > bound.least_singular_value))
 
     chosen = rng.choice(len(low), RULES.samples, p=volumes / volumes.sum())
     left = float(volumes.sum() / (parts.high - parts.low).prod()) * measure_clear(low[chosen], high[chosen])
-    # Not all is proved, whatever samples say.
+    # Some parts are not proved, so stay below 1 whatever the samples give.
     return float(np.clip(1 - left / measure_clear(parts.low, parts.high), 0.0, 1 - 2**-53))
 
 
 def _report_search(monitor: Monitor, stage: str, *, guarded: bool = False) -> Look:
-    """Reports what a search has spent of its boxes and its time or, if that is more, the volume that is proved.
+    """Report progress: the used share of boxes or of time, or the proved volume if that is larger.
 
-    Near the boundary of a domain that is `guarded` from folds, hardly any volume and most of the boxes are left. So the
-    volume says nothing of what is still to come there.
+    In a domain that is `guarded` against folds, most boxes are spent near the boundary, on hardly any volume. There,
+    the proved volume does not show how much work remains.
     """
     start = time.monotonic()
 
     def show(search: Search) -> None:
-        # As long as a box is open, the proved share is below 100 %.
+        # While a box is open, report less than 100 %.
         limits, proved = search.limits, search.proved_volume
         if search.open_count:
             proved = min(proved, 1 - 2**-53)
@@ -424,7 +429,7 @@ def _report_search(monitor: Monitor, stage: str, *, guarded: bool = False) -> Lo
 
 
 def _check_parts(check: BoxCheck, parts: Subdivision, mapped: Mapped, monitor: Monitor) -> list[BoxResults]:
-    # Leaves of the tree that count as proved, in pieces for the workers; results come in order.
+    # Split the proved leaves of the tree into pieces for the workers; results keep their order.
     low, high = parts.leaves(PROVED)
     pieces = [slice(k, k + RULES.at_once) for k in range(0, len(low), RULES.at_once)]
     results = []
@@ -433,5 +438,5 @@ def _check_parts(check: BoxCheck, parts: Subdivision, mapped: Mapped, monitor: M
             results.append(part)
             monitor(Progress("check", min(len(results) * RULES.at_once / len(low), 1.0), f"{len(low)} boxes"))
     except BrokenExecutor:
-        raise CertifyError("the executor cannot be used any more: one of its processes died") from None
+        raise CertifyError("the executor is broken, because one of its processes died: create a new one") from None
     return results

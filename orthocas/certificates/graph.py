@@ -27,8 +27,8 @@ _LINEAR = ("assign", "neg", "twice")
 _SUMS = ("add", "sub")
 
 
-Slopes = dict[int, TaylorModel]  #: derivatives by the inputs; an input that is missing has the derivative 0
-#: f' for f(a) with the value v; functions that are not among UNARY have a derivative with bounds, but no value
+Slopes = dict[int, TaylorModel]  #: derivatives by inputs; a missing input has the derivative 0
+#: derivatives f' of functions f(a) with the value v; functions outside UNARY have bounds for derivatives only
 _DERIVATIVES: dict[str, Callable[[TaylorModel, Any], TaylorModel]] = {
     "sq": lambda a, v: a.multiply_by(2.0),
     "sqrt": lambda a, v: reciprocal_square_root(a).multiply_by(0.5),
@@ -47,7 +47,7 @@ _KNOWN = {*_LINEAR, *_SUMS, *_DERIVATIVES, *POWERS, "mul", "div", "atan2"}
 
 
 class _Jet(NamedTuple):
-    """A value, None if it has no bounds, and its derivatives."""
+    """A value (None if it has no bounds), and its derivatives."""
 
     value: TaylorModel | None
     slopes: Slopes
@@ -58,21 +58,21 @@ class TaylorGraph:
     """An SX function h of q (n, 1), dense, or its derivatives by some joints, in Taylor arithmetic.
 
     Raises:
-        CertifyError: if a step has no bounds.
+        CertifyError: if an operation has no bounds.
     """
 
     tape: Tape
-    joints: tuple[int, ...] | None  #: dh/dq by these, column by column; None: h itself
+    joints: tuple[int, ...] | None  #: joints for dh/dq, column by column; None: h itself
 
     @classmethod
     def build(cls, function: ca.Function, what: str, joints: Sequence[int] | None = None) -> "TaylorGraph":
-        """The steps of a function, checked; `what` names it in errors."""
+        """Check and record the operations of a function; `what` names it in errors."""
         tape = write_tape(function)
         _require_bounds(tape, what, joints is None)
         return cls(tape, None if joints is None else tuple(joints))
 
     def __call__(self, inputs: Sequence[TaylorModel]) -> list[TaylorModel]:
-        """Values, or the entries dh_i/dq_j with the rows i of the first column first, for models of q_1, ..., q_n."""
+        """h, or the entries dh_i/dq_j column by column, for models of q_1, ..., q_n."""
         moving = self.joints or ()
 
         # The derivative of an input by itself is 1.
@@ -84,7 +84,7 @@ class TaylorGraph:
         jets = evaluate_tape(self.tape, leaf, _apply_step)
         if self.joints is None:
             return [_get_value(jet) for jet in jets]
-        # Entries that do not depend on a joint have no slope.
+        # A missing entry has the derivative 0.
         none = TaylorModel.constant(np.zeros(1))
         return [jet.slopes.get(joint, none) for joint in self.joints for jet in jets]
 
@@ -94,7 +94,7 @@ def _build_one() -> TaylorModel:
 
 
 def _apply_step(name: str, of: Sequence[_Jet]) -> _Jet:
-    """Apply one step of a tape to jets."""
+    """Apply one operation of a tape to jets."""
     a, slopes = of[0], Slopes()
     # f^k has the derivative k f^(k - 1) f'.
     if name in POWERS:
@@ -105,7 +105,7 @@ def _apply_step(name: str, of: Sequence[_Jet]) -> _Jet:
         return _Jet(power(value, exponent), slopes)
     if len(of) > 1:
         return {"add": _add, "sub": _subtract, "mul": _multiply, "div": _divide, "atan2": _take_angle}[name](*of)
-    # Of functions of one operand, those that are linear are their own derivatives.
+    # Linear functions of one operand act on derivatives as on values.
     result = UNARY[name](a.value) if name in UNARY and a.value is not None else None
     if name in _LINEAR:
         slopes = {j: UNARY[name](slope) for j, slope in a.slopes.items()}
@@ -139,14 +139,14 @@ def _divide(a: _Jet, b: _Jet) -> _Jet:
 
 
 def _take_angle(y: _Jet, x: _Jet) -> _Jet:
-    """atan2(y, x), without a value, with the derivative (x y' - y x') / (x^2 + y^2)."""
+    """atan2(y, x) without a value; its derivative is (x y' - y x') / (x^2 + y^2)."""
     a, b = _get_value(y), _get_value(x)
     inverse = reciprocal(square(b) + square(a))
     return _Jet(None, _add_slopes(_scale_slopes(b * inverse, y.slopes), _scale_slopes(-(a * inverse), x.slopes)))
 
 
 def _get_value(jet: _Jet) -> TaylorModel:
-    # `_require_bounds` has refused others.
+    # `_require_bounds` has excluded None.
     assert jet.value is not None
     return jet.value
 
@@ -168,7 +168,7 @@ def _add_slopes(*parts: Slopes) -> Slopes:
 
 
 class _Step(NamedTuple):
-    """What is known of a place of a tape before it is used."""
+    """What is known about an entry of a tape before it is evaluated."""
 
     bounded: bool  #: whether its value has bounds
     moving: bool  #: whether it has derivatives
@@ -176,17 +176,19 @@ class _Step(NamedTuple):
 
 
 def _require_bounds(tape: Tape, what: str, values: bool) -> None:
-    """Refuse operations whose derivative has no bounds, or needs a value that has none; and outputs without bounds."""
+    """Refuse operations whose derivative has no bounds or needs an unbounded value, and outputs without bounds."""
     unbounded = f"{what} uses the value of log, atan, asin, acos or atan2, which cannot be certified"
 
-    # Follow the tape with what is known of each place.
+    # Propagate this knowledge along the tape.
     def step(name: str, of: Sequence[_Step]) -> _Step:
         if name not in _KNOWN:
             raise CertifyError(f"{what} uses the operation {name}, which cannot be certified")
-        # Powers have whole constants of moderate size as exponents.
+        # Exponents must be integer constants of moderate size.
         exponent = of[1].constant if name in POWERS else 0.0
         if exponent is None or abs(exponent) > _LARGEST_POWER or exponent != round(exponent):
-            raise CertifyError(f"{what} has a power that is no whole number, so it cannot be certified")
+            raise CertifyError(
+                f"{what} has an exponent that is not a small integer constant, so it cannot be certified"
+            )
         if not all(operand.bounded for operand in _find_needed(name, of)):
             raise CertifyError(unbounded)
         bounded = (name in UNARY or name in BINARY or name in POWERS) and all(operand.bounded for operand in of)
@@ -198,7 +200,7 @@ def _require_bounds(tape: Tape, what: str, values: bool) -> None:
 
 
 def _find_needed(name: str, of: Sequence[_Step]) -> Sequence[_Step]:
-    """The operands whose values a derivative needs."""
+    """The operands whose values the derivative needs."""
     if name in _LINEAR or name in _SUMS:
         return ()
     if name == "mul":

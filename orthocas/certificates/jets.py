@@ -1,7 +1,7 @@
-"""Jets: derivatives of rows of J at the centres of boxes, and what they leave out of averages over segments.
+"""Jets: derivatives of rows of J at centres of boxes, with bounds of the truncation error of averages over segments.
 
-For points c + d and c - d, Jm(c, d) is the average of J(c + s d) over s in [-1, 1]: phi(c + d) - phi(c - d) = 2 Jm d.
-Its Taylor series about the centre of a box has the terms J^(a) (t + s d)^a / a!, of which those odd in d cancel.
+For points c + d and c - d, Jm(c, d) is the average of J(c + s d) over s in [-1, 1], so phi(c + d) - phi(c - d) = 2 Jm
+d. Its Taylor series about the centre of a box has the terms J^(a) (t + s d)^a / a!. Terms odd in d cancel.
 
 Source:
     ours, docs/explanation/certificates.md.
@@ -28,17 +28,18 @@ from orthocas.certificates.taylor import (
 )
 from orthocas.tools.checks import Array
 
-ORDERS = (4, 6)  #: of the derivatives of J that are used, at most: more of them cost more and leave less out
+#: highest orders of derivatives of J to try; a higher order costs more and has a smaller truncation error
+ORDERS = (4, 6)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Around:
-    """Boxes of centres c + C t, and half differences d = D v, for t and v in [-1, 1]^n."""
+    """Boxes of centres c + C t and half differences d = D v, for t and v in [-1, 1]^n."""
 
     centre: Array  #: c, (n, boxes)
     middles: Array  #: C, (n, boxes)
     differences: Array  #: D, (n, boxes)
-    order: int = ORDERS[0]  #: of the derivatives of J that are used at most, even
+    order: int = ORDERS[0]  #: highest order of derivatives of J, even
 
     def __getitem__(self, boxes: NDArray[np.intp]) -> "Around":
         """Some of the boxes."""
@@ -46,17 +47,17 @@ class Around:
 
     @property
     def reach(self) -> Array:
-        """How far a point c + t + s d is from c at most, (n, boxes)."""
+        """Largest distance of a point c + t + s d from c, (n, boxes)."""
         return np.asarray((self.middles + self.differences) * UP)
 
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Jets:
-    """Some rows of J: their derivatives at the centre, and what these leave out of the average."""
+    """Derivatives of some rows of J at the centre, and the truncation error of the average."""
 
-    derivatives: tuple[Array, ...]  #: by order, each (rows, columns, multi-indices of the order, boxes)
-    doubts: tuple[Array, ...]  #: bounds of their errors, of shapes that broadcast to theirs
-    rest: Array  #: (rows, columns, boxes)
+    derivatives: tuple[Array, ...]  #: by order, each (rows, columns, multi-indices of this order, boxes)
+    doubts: tuple[Array, ...]  #: error bounds of the derivatives, in shapes that broadcast to theirs
+    rest: Array  #: truncation error, (rows, columns, boxes)
 
     @classmethod
     def join(cls, parts: Sequence["Jets"]) -> "Jets":
@@ -67,12 +68,12 @@ class Jets:
         return cls(derivatives, doubts, np.concatenate([part.rest for part in parts]))
 
     def average(self, around: Around, variables: Variables) -> tuple[TaylorModel, Array]:
-        """The average of J as a model of the centre c, and terms (rows, columns, terms, boxes) with signs of their own.
+        """The average of J as a model in the centre c, and further terms (rows, columns, terms, boxes) of any sign.
 
-        The rest comes on top of both. Terms with the square of one joint's difference have one sign only: half of each
-        goes to the centre.
+        The truncation error is added to both. A term with the square of one joint's difference has only one sign, so
+        half of it is added to the centre.
         """
-        # Even orders of d stay: the model takes degrees up to 3, squares of one joint half each.
+        # Even orders of d remain. The model takes degrees up to 3, and half of each square of one joint.
         weights = [build_power_weights(around, order) for order in range(around.order + 1)]
         model = [d * w[:, 0] for d, w in zip(self.derivatives[: DEGREE + 1], weights, strict=False)]
         squared = self.derivatives[2] * (weights[2][:, 2] / 3)
@@ -83,7 +84,7 @@ class Jets:
         higher = [self.derivatives[k] * average_powers(weights[k]) for k in range(DEGREE + 1, around.order + 1)]
         terms = np.concatenate([squared, mixed, *higher], axis=2)
         coefficients = np.concatenate([centre[:, :, None], *model[1:]], axis=2)
-        # The remainder covers errors of the derivatives and rounding of the sums.
+        # The remainder covers errors of the derivatives, and rounding of the sums.
         doubt = sum((e * average_powers(w)).sum(axis=2) for e, w in zip(self.doubts, weights, strict=True))
         size = np.abs(coefficients).sum(axis=2) + np.abs(terms).sum(axis=2)
         remainder = (doubt + sum_error(8 * around.order) * size) * compute_margin(terms.shape[2]) + TINY
@@ -95,7 +96,7 @@ def build_power_weights(around: Around, order: int) -> Array:
     n, boxes = around.centre.shape
     weights = np.ones((1, 1, boxes))
     for k in range(1, order + 1):
-        # Each multi-index is one of the order before, times one more factor C + s D.
+        # Each multi-index is one of the previous order times one more factor C + s D.
         before, last = _find_prefixes(n, k)
         grown = np.zeros((len(last), k + 1, boxes))
         grown[:, :-1] = weights[before] * around.middles[last][:, None]
@@ -105,7 +106,7 @@ def build_power_weights(around: Around, order: int) -> Array:
 
 
 def average_powers(weights: Array, of_size: bool = False) -> Array:
-    """The average over s in [-1, 1] of polynomials (terms, powers, boxes) in s, or in |s|, (terms, boxes)."""
+    """Averages over s in [-1, 1] of polynomials (terms, powers, boxes) in s, or in |s|, (terms, boxes)."""
     powers = np.arange(weights.shape[1])
     averages = np.where(powers % 2 * (not of_size), 0.0, 1 / (powers + 1))
     return np.asarray(np.einsum("tkb,k->tb", weights, averages))
@@ -113,7 +114,7 @@ def average_powers(weights: Array, of_size: bool = False) -> Array:
 
 @cache
 def list_multi_indices(n: int, order: int) -> tuple[Monomial, ...]:
-    """The derivatives of one order, each as its variables in increasing order."""
+    """The multi-indices of one order, each as a list of its variables in increasing order."""
     return tuple(m for m in list_monomials(tuple(range(n)), order) if len(m) == order)
 
 
@@ -126,7 +127,7 @@ def find_neighbours(n: int, order: int) -> NDArray[np.intp]:
 
 @cache
 def _find_prefixes(n: int, order: int) -> tuple[NDArray[np.intp], NDArray[np.intp]]:
-    """For each multi-index, the place of what comes before its last variable, and that variable."""
+    """For each multi-index: the index of the multi-index without its last variable, and that variable."""
     index = {m: k for k, m in enumerate(list_multi_indices(n, order - 1))}
     indices = list_multi_indices(n, order)
     return np.array([index[m[:-1]] for m in indices]), np.array([m[-1] for m in indices])

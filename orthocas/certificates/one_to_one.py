@@ -1,12 +1,13 @@
 """Proofs that phi is one-to-one on a box.
 
 Two points q = c + d and p = c - d of the box have phi(q) - phi(p) = 2 Jm(c, d) d, see `orthocas.certificates.jets`. So
-phi is one-to-one if Jm(c, d) is nonsingular for all of them. Near the faces of the box, middles c leave little room for
-d; in its centre, J is usually best. The middles are divided into parts, and Jm is proved nonsingular on each part. Rows
-of x may be replaced by others whose differences vanish with theirs, such as those of the rotation that x stands for.
+phi is one-to-one if Jm(c, d) is nonsingular for all of them. Near the faces of the box, centres c leave little room for
+d; near its centre, J is usually best. The set of centres is divided into parts, and Jm is proved nonsingular on each
+part. The rows of x may be replaced by functions that agree at q and p exactly if x does, such as the entries of the
+rotation that x describes.
 
 If phi is the same up to a motion of the task for all positions of a leading joint, such as the turning base of an arm,
-the middle of that joint does not matter, and the coordinates bound how far two of its positions are apart.
+then the centre position of that joint is irrelevant, and the coordinates bound how far two of its positions are apart.
 """
 
 from dataclasses import dataclass, replace
@@ -53,26 +54,26 @@ from orthocas.tools.checks import Array
 class OneToOneRules:
     """Numbers of the one-to-one proof."""
 
-    at_once: int = 48  #: boxes, whose terms fit into the cache of a processor
-    rounds: int = 2  #: of bounds of the differences by the coordinates
+    at_once: int = 48  #: number of boxes whose terms fit into the cache of a processor
+    rounds: int = 2  #: rounds in which coordinates tighten the bounds of the differences
 
 
 RULES = OneToOneRules()
 
 
 def choose_one_to_one_check(chart: Chart, rows: ChartRows, base: Subdivision) -> "OneToOneCheck | ConvexCheck | None":
-    """The check for a box in the domain of a chart, with rows whose vanishing differences are those of phi.
+    """The check for a box in the domain of a chart; it may use other rows that vanish for the same differences.
 
-    None if the other rows depend on an idle joint, which then is none, or jump where an arc tangent begins a new turn,
-    or stand for those at another heading of a moving base.
+    None if the replaced rows depend on an idle joint, if an arc tangent in them jumps by a full turn, or if they belong
+    to another heading of a moving base.
     """
     tip, tree, active = TipRows.build(chart.problem.task), chart.problem.robot.tree, rows.active
     coordinates, closed_form = chart.coordinates, isinstance(rows.coordinates, ProductRows | None)
-    # Steps jump where an arc tangent begins a new turn, but for those of a coordinate's own period.
+    # An arc tangent jumps where a new turn begins; only the period of a coordinate is handled.
     jumps = (tip is None and _has_angle(rows.task)) or (_has_angle(rows.coordinates) and not rows.turns[rows.m :].all())
     if rows.base or {*rows.variables} - {*active} or jumps:
         return None
-    # Rows without derivatives in closed form have the convex check.
+    # Rows without derivatives in closed form get the convex check.
     if tip is None or not closed_form:
         true = replace(rows, task=build_true_gradients(chart.problem.task, active)[0])
         centre = chart.problem.domain.home[None]
@@ -83,7 +84,7 @@ def choose_one_to_one_check(chart: Chart, rows: ChartRows, base: Subdivision) ->
         assert isinstance(coordinates, Coordinates)
         assert isinstance(coordinates.family, ProductFamily)
         own = ProductRows.build(coordinates.family, coordinates.theta, ORDERS[-1] + 2)
-    # Leading joints on which J does not depend keep a free range.
+    # Leading joints on which J does not depend keep their whole range.
     leading = takewhile(lambda i: i not in rows.variables, tree.carriers(tree.tip_parent))
     still = tuple(active.index(i) for i in leading if i in active)
     task = TipJets.build(tip, tree, active, chart.problem.domain)
@@ -96,18 +97,18 @@ def _has_angle(rows: CoordinateRows | None) -> bool:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class OneToOneCheck:
-    """Proves that Jm(c, d) is nonsingular, for centres c in a box and all d that two points of the whole can have."""
+    """Proves that Jm(c, d) is nonsingular for centres c in a box and all d possible in the whole box."""
 
     task: "TipJets"
     coordinates: ProductRows | None
     active: tuple[int, ...]
-    still: tuple[int, ...]  #: columns of joints on whose centre Jm does not depend; they may have wide ranges
-    low: Array  #: of the whole, (n,)
+    still: tuple[int, ...]  #: columns of joints whose centre does not affect Jm; they may have wide ranges
+    low: Array  #: lower corner of the whole box, (n,)
     high: Array
 
     @property
     def joints(self) -> tuple[int, ...]:
-        """The joints whose centres matter."""
+        """The joints whose centres affect the result."""
         return tuple(joint for k, joint in enumerate(self.active) if k not in self.still)
 
     @property
@@ -121,11 +122,11 @@ class OneToOneCheck:
 
     def _check_few(self, low: Array, high: Array) -> tuple[NDArray[np.bool_], Array]:
         q, around = (low + high).T / 2, self._build_around(low, high)
-        # The coordinates bound how far two points are apart in joints that stand still.
+        # Coordinates bound how far two points are apart in these joints.
         if self.still and self.coordinates is not None:
             for _ in range(RULES.rounds):
                 around = self._narrow_differences(around, self.coordinates.build_jets(around))
-        # Higher derivatives where they may help.
+        # Use higher derivatives on boxes where they may help.
         proved, widest, promising = self._check_at_order(q, around)
         for order in ORDERS[1:]:
             again = np.flatnonzero(promising)
@@ -136,11 +137,11 @@ class OneToOneCheck:
         return proved, widest
 
     def _check_at_order(self, q: Array, around: Around) -> tuple[NDArray[np.bool_], Array, NDArray[np.bool_]]:
-        """Whether boxes are proved, the joint to halve, and whether they might be proved with higher derivatives."""
-        # The jets of the task's rows, then those of the coordinates.
+        """Whether boxes are proved, the joint to halve, and whether higher derivatives might prove them."""
+        # Jets of the task's rows, then of the coordinates.
         own = () if self.coordinates is None else (self.coordinates.build_jets(around),)
         jets = Jets.join([self.task(q, around), *own])
-        # J averaged over the segments, in the singular basis of its centre.
+        # Average J over the segments, in the singular basis of its centre.
         model, terms = jets.average(around, self.active)
         left, right = find_singular_vectors(model)
         turned = multiply_between(left, model, right)
@@ -148,7 +149,7 @@ class OneToOneCheck:
         rest = (np.abs(left) @ jets.rest.transpose(2, 0, 1) @ np.abs(right)).transpose(1, 2, 0) * UP
         all_ = replace(narrow, remainder=(narrow.remainder + rest) * UP)
         sound = is_orthogonal(left) & is_orthogonal(right)
-        # Halving joints that stand still is of no use.
+        # Halving the joints in `still` is useless.
         gains = compute_influences(all_)
         gains[:, self.still] = 0
         proved = have_positive_pivots(compute_pivots(all_)) & sound
@@ -158,22 +159,22 @@ class OneToOneCheck:
         return proved, find_most_influential(gains, self.active), promising
 
     def _build_around(self, low: Array, high: Array) -> Around:
-        """Centres of the boxes, and the largest differences that two points of the whole with such centres have."""
-        # The farther a centre is from that of the whole, the less room is left for two points around it.
+        """Centres of the boxes, and the largest differences of two points of the whole box with such centres."""
+        # A centre far from the middle of the whole box leaves less room for two points around it.
         rounding = 8 * UNIT * (np.abs(self.low) + np.abs(self.high))
         centre, outer = (self.low + self.high) / 2, (self.high - self.low) / 2
         nearest = np.maximum(np.maximum(low - centre, centre - high), 0)
         room = np.maximum(outer - nearest, 0) * UP + rounding
         half = (high - low) / 2 * UP + rounding
-        # Jm does not depend on the centre of joints that stand still.
+        # Jm does not depend on the centres of the joints in `still`.
         columns = list(self.active)
         middles = np.ascontiguousarray(half.T[columns])
         middles[list(self.still)] = 0
         return Around((low + high).T[columns] / 2, middles, np.ascontiguousarray(room.T[columns]))
 
     def _narrow_differences(self, around: Around, own: Jets) -> Around:
-        """Smaller differences: for xi(q) = xi(p), each row w of a combination of coordinates has w Jm d = 0."""
-        # The combinations are those that single out one still joint each, and the coordinates themselves.
+        """Tighten the differences: if xi(q) = xi(p), each row w of a combination of coordinates has w Jm d = 0."""
+        # Use the combinations that isolate one joint in `still` each, and the coordinates themselves.
         model, terms = own.average(around, self.active)
         centre = model.centre.transpose(2, 0, 1)
         doubt = (model.bound_deviation() + (np.abs(terms).sum(axis=2) + own.rest) * UP).transpose(2, 0, 1)
@@ -181,7 +182,7 @@ class OneToOneCheck:
         projected = np.linalg.pinv(np.nan_to_num(centre))[:, list(self.still)]
         D = around.differences.copy()
         for rows in (projected, np.broadcast_to(np.eye(r), (len(centre), r, r))):
-            # Upper and lower bounds of the sizes of rows @ J for |J - centre| <= doubt, (boxes, rows, columns).
+            # Upper and lower bounds of |rows @ J| for |J - centre| <= doubt, (boxes, rows, columns).
             size_at_centre = np.abs(rows @ centre)
             error = (np.abs(rows) @ (doubt + sum_error(rows.shape[2]) * np.abs(centre))) * UP
             sizes, least = (size_at_centre + error) * UP, (size_at_centre - error) / UP
@@ -196,15 +197,15 @@ class OneToOneCheck:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ConvexCheck:
-    """Proves that the symmetric part of P J is positive definite, for one P on all boxes and the true rows of J.
+    """Proves that the symmetric part of P J is positive definite, with one P for all boxes and the exact rows of J.
 
-    (q - p)^T P (phi(q) - phi(p)) is the integral of (q - p)^T P J (q - p) over the segment between points of a convex
-    set, so it is positive. This is for rows that have bounds, but no derivatives in closed form.
+    On a convex set, (q - p)^T P (phi(q) - phi(p)) is the integral of (q - p)^T P J (q - p) over the segment from p to
+    q, so it is positive. This check is for rows with bounds but without derivatives in closed form.
     """
 
     rows: ChartRows
     inverse: Array  #: P, (active, active)
-    low: Array  #: of the convex set, (n,)
+    low: Array  #: lower corner of the convex set, (n,)
     high: Array
     still_joints: tuple[int, ...] = ()
 
@@ -226,11 +227,11 @@ class ConvexCheck:
             product, coefficients=product.coefficients.swapaxes(1, 2), remainder=product.remainder.swapaxes(0, 1)
         )
         symmetric = product + transposed
-        # In its eigenvectors, the symmetric part is nearly diagonal.
+        # In the basis of its eigenvectors, the symmetric part is nearly diagonal.
         vectors = np.linalg.eigh(np.nan_to_num(np.moveaxis(symmetric.centre, -1, 0)))[1][:, :, ::-1]
         turned = multiply_between(vectors.transpose(0, 2, 1), symmetric, vectors)
         proved = have_positive_pivots(compute_pivots(turned)) & is_orthogonal(vectors)
-        # Rows with a period change by less than it, over the widths at their largest slopes.
+        # A row with a period must change by less than this period over the whole box, at its largest slopes.
         circles = np.flatnonzero(self.rows.turns)
         widths = (self.high - self.low)[list(self.rows.active), None] * UP
         change = (J.bound_magnitude()[circles] * widths).sum(axis=1)
@@ -258,26 +259,26 @@ def _spread(left: Array, terms: Array, right: Array) -> Array:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class TipJets:
-    """The rows of a tip task in the axes of the world, for columns of some joints in increasing order."""
+    """Rows of a tip task in world axes, for the columns of some joints in increasing order."""
 
     rows: TipRows
     tree: KinematicTree
     columns: tuple[int, ...]
-    lengths: Array  #: bounds of the distance from each joint's origin to the tip, 1 for prismatic joints, (columns,)
-    doubt: float  #: bound of the error of an entry, from rounding and rotations that are none
+    #: upper bounds of the distance from each joint's origin to the tip, 1 for prismatic joints, (columns,)
+    lengths: Array
+    doubt: float  #: error bound of an entry, from rounding and from stored matrices that are not exact rotations
 
     @classmethod
     def build(cls, rows: TipRows, tree: KinematicTree, columns: tuple[int, ...], domain: Domain) -> "TipJets":
-        """Build the check for boxes within a domain."""
-        # From the tip inwards, each joint's distance is at most the length of the chain behind it.
-        # Rounding of the kinematics, relative to the reach of the arm.
+        """Build the jets for boxes within a domain."""
+        # Rounding errors of the kinematics, relative to the reach of the arm.
         doubt = 64 * (tree.n + 8) * bound_rotation_error(tree) * bound_reach(tree, domain)
         chain = tree.carriers(tree.tip_parent)
         slides = np.where(tree.prismatic, np.abs(domain.centre) + domain.half_width, 0.0)
         steps = np.linalg.norm(tree.translations, axis=1) + slides
         beyond = float(np.linalg.norm(tree.tip_translation))
         longer = 1 + 16 * tree.n * bound_rotation_error(tree)
-        # From the tip inwards: the farthest that each joint can move it.
+        # Going from the tip to the base, a joint's distance to the tip is at most the length of the chain behind it.
         lengths = dict.fromkeys(columns, 0.0)
         for i in reversed(chain):
             lengths[i] = 1.0 if tree.prismatic[i] else beyond
@@ -285,8 +286,8 @@ class TipJets:
         return cls(rows, tree, columns, np.array([lengths[i] for i in columns]) * longer, doubt)
 
     def __call__(self, q: Array, around: Around) -> Jets:
-        """Jets at joint positions q (all joints, boxes), the columns of which are the centres of the boxes."""
-        # Each part has nested cross products of joint axes: of arms, of rotations, of one axis.
+        """Jets at joint positions q (all joints, boxes), whose columns are the centres of the boxes."""
+        # Each part consists of nested cross products of joint axes with an arm, a rotation, or an axis of the tip.
         axes, arms, R = self._compute_geometry(q)
         turning = np.array([not self.tree.prismatic[i] for i in self.columns])
         carried = np.array([i in self.tree.carriers(self.tree.tip_parent) for i in self.columns])
@@ -307,7 +308,7 @@ class TipJets:
             nested = _nest_products(outer, first, around.order)
             parts.append([np.einsum("bxk,mxb->mkb", across, each) for each in nested])
             rests.append(np.repeat(self._bound_rest_of_turns(around, turning & carried)[None], 2, axis=0))
-        # Derivatives of all parts, in the order of their rows.
+        # Collect the derivatives of all parts in the order of their rows.
         n = len(self.columns)
         derivatives = tuple(
             np.concatenate([part[order][find_neighbours(n, order + 1)] for part in parts], axis=2).transpose(2, 0, 1, 3)
@@ -317,13 +318,13 @@ class TipJets:
         return Jets(derivatives, (doubt,) * (around.order + 1), np.concatenate(rests) * UP)
 
     def _bound_rest_of_turns(self, around: Around, turning: Array) -> Array:
-        """The rest for vectors of length 1 that prismatic joints leave alone."""
+        """Truncation error for unit vectors, which prismatic joints do not change."""
         still = np.logical_not(turning)[:, None]
         part = Around(around.centre, np.where(still, 0, around.middles), np.where(still, 0, around.differences))
         return _bound_rest(part, np.asarray(turning, dtype=float))
 
     def _compute_geometry(self, q: Array) -> tuple[Array, Array, Array]:
-        """Axes of the columns' joints and arms from their origins to the tip, (columns, 3, boxes); R, (boxes, 3, 3)."""
+        """Joint axes and arms from their origins to the tip, (columns, 3, boxes); R of the tip, (boxes, 3, 3)."""
         boxes = q.shape[1]
         # Forward kinematics of the chain, for all boxes at once.
         R, p = np.broadcast_to(np.eye(3), (boxes, 3, 3)), np.zeros((boxes, 3))
@@ -334,13 +335,13 @@ class TipJets:
             if self.tree.prismatic[i]:
                 p = p + R[:, :, 2] * q[i][:, None]
             else:
-                # Turn about z.
+                # Rotation about z.
                 (s, _), (c, _) = evaluate_sine_cosine(q[i])
                 zero, one = np.zeros_like(s), np.ones_like(s)
                 turn = np.stack([c, -s, zero, s, c, zero, zero, zero, one], axis=-1).reshape(-1, 3, 3)
                 R = R @ turn
             axes[i], origins[i] = R[:, :, 2], p
-        # Joints beside the chain do not move the tip.
+        # Joints outside the chain do not move the tip.
         tip = p + R @ self.tree.tip_translation
         nothing = np.zeros((boxes, 3))
         own = np.stack([axes.get(i, nothing).T for i in self.columns])
@@ -365,7 +366,7 @@ def _nest_rotations(axes: Array, highest: int) -> list[Array]:
     for k in range(3):
         i, j = (k + 1) % 3, (k + 2) % 3
         crosses[:, j, i], crosses[:, i, j] = axes[:, k], -axes[:, k]
-    # Products of one more axis for each order, of which the skew part counts.
+    # Each order multiplies by one more axis; keep the skew part of the products.
     nested, product = [], crosses
     for order in range(1, highest + 2):
         if order > 1:
@@ -377,27 +378,27 @@ def _nest_rotations(axes: Array, highest: int) -> list[Array]:
 
 
 def _split(n: int, order: int) -> tuple[Array, Array]:
-    """The first joint of each multi-index of an order, and the place of the others among those of one order less."""
+    """For multi-indices of an order: the first joint, and the index of the remaining multi-index."""
     index = {m: k for k, m in enumerate(list_multi_indices(n, order - 1))}
     indices = list_multi_indices(n, order)
     return np.array([m[0] for m in indices]), np.array([index[m[1:]] for m in indices])
 
 
 def _bound_rest(around: Around, lengths: Array) -> Array:
-    """What the derivatives of J that are used leave out of the average, (columns, boxes).
+    """Truncation error of the average with these derivatives of J, (columns, boxes).
 
-    Of the next order at the centre, the terms that are odd in d cancel; the one after it is bounded everywhere between
-    the points. The length of a derivative depends on the last of its joints: sums over joints up to each, weighted by
-    their steps.
+    Two orders remain. In the next order, evaluated at the centre, only the terms even in d count. The order after it is
+    bounded for all points of the segment. The length of a derivative depends on the last of its joints only. So each
+    joint's length is multiplied by a sum over the joints up to it, weighted by their steps.
     """
-    # Averages over s of sums over all multi-indices, by the sums of middles and differences of joints up to each.
+    # Average over s the sums over all multi-indices, from cumulative sums of centres and differences over the joints.
     next_ = around.order + 1
     c, s = np.cumsum(around.middles, axis=0), np.cumsum(around.differences, axis=0)
     odd = sum(comb(next_, k) * c ** (next_ - k) * s**k / (k + 1) for k in range(0, next_, 2))
     even = sum(comb(next_ + 1, k) * c ** (next_ + 1 - k) * s**k / (k + 1) for k in range(next_ + 2))
     upto = (odd / factorial(next_) + even / factorial(next_ + 1)) * UP
     steps = np.diff(upto, axis=0, prepend=0.0) * lengths[:, None]
-    # Of the joint itself and those after it, then of those before.
+    # Contributions of the joint itself and those after it, then of those before it.
     later = np.cumsum(steps[::-1], axis=0)[::-1]
     before = upto - np.diff(upto, axis=0, prepend=0.0)
     return np.asarray((later + before * lengths[:, None]) * UP)

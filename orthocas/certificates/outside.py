@@ -1,4 +1,4 @@
-"""What a proof must know beyond the box: parts of a domain, endless joints."""
+"""Parts of a box outside the domain, and endless joints, for proofs."""
 
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass
@@ -42,73 +42,74 @@ from orthocas.tools.expressions import Tape, evaluate_tape, find_gradient_depend
 
 @dataclass(frozen=True, slots=True)
 class OutsideRules:
-    """Margins of proofs that boxes lie outside a domain, and when they are tried."""
+    """Margins of proofs that boxes lie outside a domain, and when to try these proofs."""
 
-    rounding: float = 1e-6  #: of distances, far above that of floating-point numbers
-    #: of squares: far above what singular vectors miss that are orthogonal up to 1e-9, and roundings of D
+    rounding: float = 1e-6  #: margin of distances, far above floating-point errors
+    #: margin of squares, far above the error of singular vectors that are orthogonal up to 1e-9, and rounding of D
     lengths: float = 1e-7
-    #: how much a singular value changes over a box, at least in most cases: by so much of its half-widths
+    #: typical change of a singular value over a box, per half-width
     steep: float = 0.08
-    thin: float = 0.25  #: of the widest joint: narrower boxes are thin
-    guards: float = 1e-12  #: of |J|^2: elimination in floating-point numbers is exact to less, so guards agree
+    thin: float = 0.25  #: boxes narrower than this fraction of the widest joint are thin
+    #: margin relative to |J|^2, above the error of floating-point elimination, so that domain checks agree
+    guards: float = 1e-12
 
 
 RULES = OutsideRules()
 
 
 def choose_check(chart: Chart, rows: ChartRows, bound: float, method: str | None = None) -> RegularCheck:
-    """The check of a chart: of its whole box or, of a part of it, of what is not proved to lie outside.
+    """The check of a chart on the whole box, or on the part of it that is not proved to lie outside the domain.
 
     Args:
         chart: the chart.
         rows: its rows.
-        bound: of the conditioning.
-        method: of the proofs inside. Default: the fastest.
+        bound: bound of the conditioning.
+        method: method of the proofs inside. Default: the fastest.
 
     Raises:
-        CertifyError: if there is no such method for the chart; if a joint is unbounded, and a proof for its half-width
-            is none for all its positions. In a corridor, an unbounded joint whose distance to the path counts is one of
-            these.
+        CertifyError: if the chart has no such method, or if a joint is unbounded and a proof for its half-width does
+            not hold at all its positions. The latter includes unbounded joints whose distance to the path of a corridor
+            is counted.
     """
     domain = chart.problem.domain
     domain.require_bounds("proof")
     require_all_positions(chart, rows.variables)
     check, path, singular = choose_inside_check(chart, rows, bound, method), domain.path_bound, domain.singular_bound
     if path is not None:
-        # After a turn of an unbounded joint that counts, what is far from the path may be near it.
+        # A full turn of an unbounded counted joint may lead from far to near the path.
         for joint in {*path.unbounded} & {*path.counted.tolist()}:
             name = chart.problem.robot.joint_names[joint]
-            raise CertifyError(f"joint '{name}' is unbounded and counts in the corridor, expected an infinite radius")
+            raise CertifyError(f"joint '{name}' is unbounded, expected an infinite radius for it in the corridor")
         start = path.postures[path.contains(path.postures)][:1]
         return CorridorCheck(check, path, float(check(start, start).sign[0]))
     if singular is None:
         return check
     own, variables = _choose_rows(chart, singular)
     require_all_positions(chart, variables)
-    # The sign is that of these rows, which have other scales than the chart's.
+    # Take the sign from these rows, because their scales differ from the chart's.
     sign = float(check(domain.home[None], domain.home[None]).sign[0])
     return OutsideCheck(check, own, singular, sign, tuple(sorted(variables)), domain.room_to_fold is not None)
 
 
 def choose_inside_check(chart: Chart, rows: ChartRows, bound: float, method: str | None = None) -> RegularCheck:
-    """The check of boxes that lie in the domain; see `choose_check`."""
+    """The check of boxes inside the domain; see `choose_check`."""
     determinant = Determinant.build(chart) if bound == 0 and method != ELIMINATION else None
     if determinant is not None:
         return CofactorCheck(determinant)
     if method == COFACTORS:
-        raise CertifyError("the chart's determinant has no expansion, so it has no certificate of this method")
+        raise CertifyError("the chart's determinant has no expansion, so this method cannot certify it")
     return EliminationCheck(rows, bound)
 
 
 def _choose_rows(chart: Chart, domain: SingularBound) -> tuple[GraphRows, set[int]]:
-    """The rows that check positions, as `domain.is_clear` takes them, and the joints that they depend on.
+    """The rows whose singular values `domain.is_clear` bounds, and the joints that they depend on.
 
-    Rows of a whole position or a whole orientation may be rotated if they have the same scale: then the rotation
-    changes no singular value, and rows in the axes of a body of the arm depend on fewer joints.
+    The rows of a whole position or a whole orientation may be rotated if they have the same scale, because a rotation
+    preserves singular values. In the axes of a body of the arm they depend on fewer joints.
     """
     task, joints = chart.problem.task, range(chart.n)
     tip = TipRows.build(task)
-    # the rows of the tip serve if the scale does not depend on the axes
+    # Rotated rows can be used if the scale is the same for all axes.
     if tip is not None and tip.axis is None and len(domain.scale) % 3 == 0:
         own_axes = domain.jacobian_function is task.frame_jacobian_function or not tip.rotation
         if own_axes and (domain.scale[::3] == domain.scale.reshape(-1, 3).T).all():
@@ -119,20 +120,20 @@ def _choose_rows(chart: Chart, domain: SingularBound) -> tuple[GraphRows, set[in
 
 
 def require_all_positions(chart: Chart, variables: Collection[int]) -> None:
-    """Raise CertifyError unless a proof for the half-widths of unbounded joints is one for all their positions.
+    """Raise CertifyError unless a proof for the half-widths of unbounded joints holds for all their positions.
 
-    It is one for a joint that is not among the variables of the proof, and for a revolute joint whose half-width is at
-    least half a turn, if J is the same after a full turn of it. No word of the file is taken for that: the steps of h
-    and of xi are read. The joints of a torus are unbounded.
+    It holds for a joint that is not a variable of the proof. It also holds for a revolute joint whose half-width is at
+    least half a turn, if J is the same after a full turn. This is determined from the operations of h and of xi, not
+    from statements of the file. The joints of a torus are unbounded.
     """
     problem = chart.problem
-    # Joints without bounds on which the proof depends must repeat after a turn.
+    # Unbounded joints that the proof depends on must be periodic.
     endless = np.flatnonzero(np.isinf(problem.domain.bounds[1])).tolist()
     endless_variables = [joint for joint in endless if joint in variables]
     if not endless_variables:
         return
     coordinates = chart.coordinates
-    # `build_chart_rows` has refused others.
+    # `build_chart_rows` has refused other types.
     assert isinstance(coordinates, Coordinates)
     # A full turn must change neither J_x nor J_xi.
     alike = _find_unchanged(write_tape(problem.task.smooth_function), chart.n)
@@ -141,22 +142,24 @@ def require_all_positions(chart: Chart, variables: Collection[int]) -> None:
     for joint in endless_variables:
         name = problem.robot.joint_names[joint]
         if problem.robot.tree.prismatic[joint] or problem.domain.half_width[joint] < np.pi:
-            raise CertifyError(f"joint '{name}' is unbounded and J depends on it, expected bounds, or a full turn")
+            raise CertifyError(
+                f"joint '{name}' is unbounded and J depends on it, expected bounds, or a half-width of pi"
+            )
         if joint not in alike:
             raise CertifyError(
                 f"joint '{name}' is unbounded and J is not periodic in it, expected bounds, or a task and coordinates "
-                "that are (Fourier, networks of sines and cosines, or a linear term only)"
+                "that are periodic (Fourier terms, networks of sines and cosines, or a linear term in this joint only)"
             )
 
 
 def _find_periodic_inputs(coordinates: Coordinates) -> set[int]:
-    """The active joints, by their places among these, whose full turns do not change J_xi."""
+    """Indices among the active joints of those whose full turns do not change J_xi."""
     family, n = coordinates.family, len(coordinates.active)
-    # Networks take sines and cosines of all joints that they do not take as they are.
+    # Networks are periodic in the joints that enter as sines and cosines.
     if isinstance(family, MLPFamily):
         return {*range(n)} - {*family.direct}
     q = ca.SX.sym("q", n)
-    # Each function of a basis is looked at alone.
+    # Check each function of a basis by itself.
     if isinstance(family, LinearFamily):
         values = family.basis(q)
     else:
@@ -177,7 +180,7 @@ def find_periodic_joints(tape: Tape, n: int) -> frozenset[int]:
     def leaf(name: str, of: Any) -> _Shift:
         return _Shift(nothing, float(of)) if name == "const" else _Shift(unit[of])
 
-    # Only whole numbers of moderate size are added and multiplied, which is exact.
+    # Only integers of moderate size are added and multiplied, which is exact.
     def step(name: str, of: Sequence[_Shift]) -> _Shift:
         shifts = [each.turn for each in of]
         if name in _EXACT:
@@ -185,7 +188,8 @@ def find_periodic_joints(tape: Tape, n: int) -> frozenset[int]:
         for one, other in ((of[0], of[-1]), (of[-1], of[0])):
             if name == "mul" and one.constant is not None:
                 return _Shift(_keep_whole(np.where(other.turn == 0, 0.0, other.turn * one.constant)))
-        # Other functions stay where all that they depend on does; those with a period, where it turns as a whole.
+        # Other functions are unchanged if their operands are. Periodic ones are also unchanged after full turns of an
+        # operand.
         still = np.all([shift == 0 for shift in shifts], axis=0)
         if name in ("sin", "cos", "tan"):
             still = ~np.isnan(shifts[0])
@@ -197,9 +201,9 @@ def find_periodic_joints(tape: Tape, n: int) -> frozenset[int]:
 
 
 class _Shift(NamedTuple):
-    """What a full turn does to a value."""
+    """The effect of full turns on a value."""
 
-    turn: Any  #: change by a turn of each joint / 2 pi; NaN where it is no constant
+    turn: Any  #: change by a turn of each joint / 2 pi; NaN if it is not a constant
     constant: float | None = None  #: the value itself, if it is a number
 
 
@@ -218,26 +222,27 @@ def _keep_whole(shift: Any) -> Any:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class OutsideCheck:
-    """Counts boxes as proved, without a sign, that lie outside a ClearBox: s(q) <= bound all over the box.
+    """Marks boxes that lie outside a ClearBox, with s(q) <= bound on the whole box, as proved without a sign.
 
-    s(q) <= |v^T D^-1 J(q)| for all |v| >= 1, with the rows J that count in that ClearBox. Here v(q) is the singular
-    vector of the smallest singular value at the centre of the box, plus as much of the others, linear in q, as cancels
-    the change of v^T D^-1 J along them to first order. Another check evaluates the other boxes, and their det J must
-    have the sign of the centre of the domain: a box with the other sign is halved until its parts lie outside, or a
-    fold shows. Where the domain itself keeps folds out, a box with the other sign is left to it: it is not proved,
-    halving it is of no use, and its sign is no fold of the chart.
+    s(q) <= |v^T D^-1 J(q)| for all |v| >= 1, with the rows J of that ClearBox. Here v(q) starts from the singular
+    vector of the smallest singular value at the centre of the box. Multiples of the other singular vectors, linear in
+    q, are added to it, so that they cancel the first-order change of v^T D^-1 J along them.
+
+    Another check evaluates the other boxes. Their det J must have the sign of the centre of the domain. A box with the
+    other sign is halved until its parts lie outside or a fold is found. If the domain itself excludes folds, a box with
+    the other sign is left open without halving, and its sign does not count as a fold of the chart.
     """
 
     inside: RegularCheck
-    rows: GraphRows  #: J, the rows that check, or C(q) J with orthogonal C if all entries of D are the same
+    rows: GraphRows  #: J, the bounded rows, or C(q) J with orthogonal C if all entries of D are equal
     domain: SingularBound
-    sign: float  #: of det J at the centre of the domain
+    sign: float  #: sign of det J at the centre of the domain
     variables: Variables
-    guarded: bool = False  #: whether the domain itself keeps folds out
+    guarded: bool = False  #: whether the domain itself excludes folds
 
     @property
     def method(self) -> str:
-        """The method of the proofs inside."""
+        """Name of the method of the inner check."""
         return self.inside.method
 
     @property
@@ -249,14 +254,14 @@ class OutsideCheck:
         """Evaluate boxes between corners (boxes, n)."""
         inside = self.inside(low, high)
         own = inside.proved & (inside.sign == self.sign)
-        # Singular values are needed at the centres of boxes that are not proved.
+        # Compute singular values at the centres of boxes without a proof.
         values = np.full(len(low), np.inf)
         if not own.all():
             values[~own] = self.domain.singular_values((low + high)[~own] / 2)
-        # Boxes that may lie outside: others, too large for the value at their centre, are rarely proved to.
+        # Try boxes that may lie outside. Other boxes are too large for the value at their centre.
         half = (high - low)[:, list(self.variables)] / 2
         near = np.asarray(self.domain.least_singular_value - values > RULES.steep * half.sum(axis=1))
-        # Thin boxes with a centre outside are halved in their widest joint, so that they become worth a try.
+        # Halve thin boxes with a centre outside in their widest joint, so that a proof becomes likely.
         joints = np.array(self.joints)
         widths = (high - low)[:, joints] / 2
         halved = (high - low)[np.arange(len(low)), np.maximum(inside.widest, 0)] / 2
@@ -268,7 +273,7 @@ class OutsideCheck:
             with one_blas_thread():
                 outside[near], widest[near] = self.check_outside(low[near], high[near])
         regular, sign = inside.regular & ~outside, np.where(outside, 0, inside.sign)
-        # A domain that keeps folds out takes care of boxes with the other sign itself.
+        # A domain that excludes folds handles boxes with the other sign itself.
         if self.guarded:
             widest[regular & ~own & (values > self.domain.least_singular_value)] = NEVER
             regular, sign = regular & (sign == self.sign), np.where(sign == self.sign, sign, 0)
@@ -281,10 +286,10 @@ class OutsideCheck:
         )
 
     def check_outside(self, low: Array, high: Array) -> tuple[Array, Array]:
-        """Whether boxes lie outside, and the joint to halve to find out."""
+        """Whether boxes lie outside, and the joint to halve otherwise."""
         joints = build_joint_models(low, high, self.variables)[0]
         J = self.rows(joints).multiply_by(1 / self.domain.scale[:, None, None])
-        # The row v^T J with the change along the other singular vectors taken out.
+        # Row v^T J, with its change along the other singular vectors removed.
         left, right = find_singular_vectors(J)
         with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
             turned = multiply_between(left, J, right)
@@ -299,7 +304,7 @@ class OutsideCheck:
             squared = (sizes**2).sum(axis=0) * UP
             squared += RULES.guards * (J.bound_magnitude() ** 2).sum(axis=(0, 1))
             influences = (least.compute_gains() * sizes).sum(axis=1)
-        # Its length bounds the smallest singular value from above.
+        # The length of this row is an upper bound of the smallest singular value.
         small = squared <= self.domain.least_singular_value**2 * (1 - RULES.lengths)
         outside: Array = small & is_orthogonal(left) & is_orthogonal(right)
         return outside, find_most_influential(influences.T, least.variables)
@@ -307,11 +312,11 @@ class OutsideCheck:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class CorridorCheck:
-    """Counts boxes as proved, without a sign, that are farther from the path than the radius.
+    """Marks boxes that are farther from the path than the radius as proved, without a sign.
 
-    A box is, if the distance of its centre is larger than the radius by more than half of its diagonal.
+    A box is farther if the distance of its centre exceeds the radius by more than half its diagonal.
 
-    Another check evaluates the other boxes, and their det J must have the sign of the first posture of the path.
+    Another check evaluates the other boxes. Their det J must have the sign of the first posture of the path.
     """
 
     inside: RegularCheck
@@ -320,12 +325,12 @@ class CorridorCheck:
 
     @property
     def method(self) -> str:
-        """The method of the proofs inside."""
+        """Name of the method of the inner check."""
         return self.inside.method
 
     @property
     def joints(self) -> Variables:
-        """All joints: parts may lie outside in each of them."""
+        """All joints, because parts may lie outside in each of them."""
         return tuple(range(len(self.domain.centre)))
 
     def __call__(self, low: Array, high: Array) -> BoxResults:
@@ -336,7 +341,7 @@ class CorridorCheck:
         inside = self.inside(low, high)
         return BoxResults(
             proved=(inside.proved & (inside.sign == self.sign)) | outside,
-            # Only these signs are of the corridor.
+            # Only signs at centres in the corridor count.
             regular=inside.regular & (distance <= 1),
             sign=np.where(outside, 0, inside.sign),
             conditioning=np.where(outside, np.inf, inside.conditioning),

@@ -1,15 +1,15 @@
-"""Rows of the Jacobian of phi as Taylor models: of tasks, product bases, and networks.
+"""Rows of the Jacobian of phi as Taylor models, for tasks, product bases and networks.
 
-Multiplying the rows from the left by a matrix that is never singular changes neither whether J is, nor the sign of its
-determinant if that matrix has a positive one. So rows of a tip task become those of the frame Jacobian: the velocity of
-the tip and its angular velocity. In the axes of a body in the middle of the chain, each entry depends on fewer joints
-than in the axes of the world, so boxes can be larger. Half a turn of the tool away from the reference, where the
-components of x lose rank though the arm does not, these rows are as regular as anywhere.
+Multiplying the rows from the left by a nonsingular matrix does not change whether J is singular. If the matrix has a
+positive determinant, the sign of det J stays too. So the rows of a tip task may be replaced by those of the frame
+Jacobian: velocity and angular velocity of the tip. In the axes of a body in the middle of the chain, each entry depends
+on fewer joints than in world axes, so boxes can be larger. These rows are regular even half a turn from the reference,
+where the components of x lose rank though the arm does not.
 
-The stored rotations of a robot are rotations up to rounding only. Each of the at most n factors then changes an entry
-by at most their deviation times the length of the chain, and an allowance covers all changes. It also covers the
-constants that CasADi multiplies and adds while it builds these rows: fewer than 10 n roundings of numbers up to the
-length, and the allowance is 512 n of them. All other rows come from `graph`, which rounds nothing unseen.
+The stored rotations of a robot are rotations up to rounding only. Each of the at most n factors changes an entry by at
+most its deviation times the length of the chain, and an allowance covers all changes. It also covers the constants that
+CasADi multiplies and adds while it builds these rows: these are fewer than 10 n roundings of numbers up to the length,
+and the allowance is 512 n of them. All other rows come from `graph`, which includes all rounding.
 
 Source:
     ours, docs/explanation/certificates.md.
@@ -66,27 +66,27 @@ from orthocas.tools.batch import dense_function
 from orthocas.tools.checks import Array
 from orthocas.tools.expressions import find_gradient_dependences
 
-MOST_VARIABLES = 20  #: joints on which J may depend
-_MOST_STEPS = 100_000  #: operations of coordinates, times joints
+MOST_VARIABLES = 20  #: largest number of joints that J may depend on
+_MOST_STEPS = 100_000  #: largest number of operations of coordinates times joints
 CoordinateRows = Callable[[list[TaylorModel], Array, Variables], TaylorModel]
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class ChartRows:
-    """J on boxes, without idle joints: their rows and columns are those of the identity.
+    """J on boxes, without idle joints, whose rows and columns are those of the identity.
 
-    The rows of the task may be rotated, and those of the coordinates lack their scale, so that det J keeps its sign.
-    Where a base moves, J stands for that at one place and heading, see `_find_base`.
+    The rows of the task may be rotated, and those of the coordinates are not scaled; the sign of det J stays. On a
+    moving base, J is evaluated at one position and heading, see `_find_base`.
     """
 
     n: int
     m: int
-    active: Variables  #: joints that are not coordinates themselves: the columns
+    active: Variables  #: joints that are not coordinates themselves; they are the columns
     variables: Variables  #: joints that J depends on
-    task: "GraphRows"  #: of the active joints
+    task: "GraphRows"  #: task rows for the active joints
     coordinates: CoordinateRows | None
-    turns: Array  #: periods of the rows; 0 for those that have none
-    base: Variables = ()  #: joints of a moving base on which J depends, but det J does not
+    turns: Array  #: periods of the rows; 0 for rows without a period
+    base: Variables = ()  #: joints of a moving base that J depends on, but det J does not
 
     def __call__(self, low: Array, high: Array) -> TaylorModel:
         """Models (active, active, boxes) for the boxes between corners (boxes, n)."""
@@ -95,7 +95,7 @@ class ChartRows:
         if self.coordinates is not None:
             active = list(self.active)
             rows.append(self.coordinates([joints[i] for i in active], half_widths[active], self.active))
-        # All rows get the variables that they have together.
+        # Extend all rows to the union of their variables.
         variables = tuple(sorted({v for part in rows for v in part.variables}))
         rows = [part.extend(variables) for part in rows]
         return TaylorModel(
@@ -107,7 +107,7 @@ class ChartRows:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class GraphRows:
-    """A matrix whose entries a graph computes, column by column."""
+    """A matrix whose entries a TaylorGraph computes, column by column."""
 
     graph: TaylorGraph
     rows: int
@@ -126,7 +126,7 @@ class GraphRows:
 
 
 def build_chart_rows(chart: Chart) -> ChartRows:
-    """The rows of a fitted chart.
+    """Build the rows of a fitted chart.
 
     Raises:
         CertifyError: if the chart is grown, or uses operations without proven bounds.
@@ -136,11 +136,11 @@ def build_chart_rows(chart: Chart) -> ChartRows:
         raise CertifyError(f"a chart with {coordinates.label} coordinates has no expression, expected a fitted chart")
     if not np.all(coordinates.scale != 0):
         raise CertifyError("a coordinate is scaled by 0, so it is constant, expected coordinates that vary")
-    # Rows of the task and of the coordinates, for joints that are no coordinates themselves.
+    # Rows of the task and of the coordinates, for joints that are not coordinates themselves.
     active = tuple(coordinates.active)
     task, moved_by = build_task_rows(chart.problem.task, chart.problem.domain, active)
     own, depends = _build_coordinate_rows(coordinates)
-    # A base at whose positions det J is the same stands still.
+    # Keep a base at rest if det J is the same at all its positions.
     base = _find_base(chart)
     variables = tuple(sorted({*moved_by, *depends} - {*base}))
     if len(variables) > MOST_VARIABLES:
@@ -151,12 +151,12 @@ def build_chart_rows(chart: Chart) -> ChartRows:
 
 
 def _find_base(chart: Chart) -> Variables:
-    """The joints of a planar base at whose positions det J is the same, because `Mobile` coordinates move with it.
+    """The joints of a planar base that does not affect det J, because `Mobile` coordinates move with it.
 
-    With the place p, the heading t and the arm's joints a, J(p, t, a) = D J(0, 0, a) E. D turns the rows of x and y and
-    those of xi_1 and xi_2 by R(t); E turns the columns of p by R(-t); both have the determinant 1. Rows of the
-    orientation in axes of the tip, z, and all other coordinates stay as they are. This holds for tasks of the tip's
-    whole position and of its orientation, if the base carries the tip: no word of a file is taken for that.
+    With the position p, the heading t and the arm's joints a, J(p, t, a) = D J(0, 0, a) E. D turns the rows of x and y
+    and those of xi_1 and xi_2 by R(t), and E turns the columns of p by R(-t); both have determinant 1. Rows of the
+    orientation in axes of the tip, the row of z, and all other coordinates stay the same. This holds for tasks of the
+    tip's whole position and of its orientation, if the base carries the tip, which is checked.
     """
     coordinates, problem = chart.coordinates, chart.problem
     assert isinstance(coordinates, Coordinates)
@@ -166,9 +166,9 @@ def _find_base(chart: Chart) -> Variables:
     try:
         chosen.for_problem(problem)
     except InvalidValueError as error:
-        raise CertifyError(f"the base of the chart is none: {error}") from None
+        raise CertifyError(f"the base of the chart is not a planar base: {error}") from None
     tree = problem.robot.tree
-    # The base must carry the tip, joint by joint from the world on.
+    # Check that the base carries the tip, joint by joint from the world on.
     places = tuple(tree.joint_names.index(name) for name in chosen.base)
     if tree.carriers(tree.tip_parent)[: len(places)] != list(places) or not isinstance(problem.domain, Box):
         return ()
@@ -184,7 +184,7 @@ def build_task_rows(task: Task, domain: Domain, joints: Sequence[int]) -> tuple[
 
 
 def build_closed_form(rows: ca.Function, joints: Sequence[int], allowance: float = 0.0) -> tuple[GraphRows, set[int]]:
-    """Columns of a matrix that a function of q gives as it is, and the joints that they depend on."""
+    """Columns of the matrix that a function of q returns, and the joints that they depend on."""
     q = ca.SX.sym("q", rows.size1_in(0))
     J = ca.densify(rows(q)[:, list(joints)])
     graph = TaylorGraph.build(dense_function("task_rows", [q], [J]), "the task")
@@ -192,7 +192,7 @@ def build_closed_form(rows: ca.Function, joints: Sequence[int], allowance: float
 
 
 def build_true_gradients(task: Task, joints: Sequence[int]) -> tuple[GraphRows, set[int]]:
-    """Columns of J_x itself, the derivative of h, and the joints that they depend on."""
+    """Columns of J_x by differentiation of h, and the joints that they depend on."""
     return _build_derivatives(task.smooth_function, joints, "the task")
 
 
@@ -206,7 +206,7 @@ def _build_derivatives(function: ca.Function, joints: Sequence[int], what: str) 
 def build_joint_models(low: Array, high: Array, variables: Variables) -> tuple[list[TaylorModel], Array]:
     """Models of q_1, ..., q_n on boxes between corners (boxes, n), and the half-widths (n, boxes).
 
-    Joints that are no variables stand still at the centre of the box: J does not depend on them.
+    Other joints stay at the centre of the box, because J does not depend on them.
     """
     centre = (low + high) / 2
     half = np.nextafter(np.maximum(high - centre, centre - low), np.inf) + TINY
@@ -222,10 +222,10 @@ def build_joint_models(low: Array, high: Array, variables: Variables) -> tuple[l
 
 
 def _build_coordinate_rows(coordinates: Coordinates) -> tuple[CoordinateRows | None, set[int]]:
-    """The fitted coordinates, and the joints they depend on."""
+    """Rows of the fitted coordinates, and the joints that they depend on."""
     if not len(coordinates.offset):
         return None, set()
-    # Product bases and networks have rows of their own; others are differentiated step by step.
+    # Product bases and networks have rows of their own. Other families are differentiated operation by operation.
     family, active = coordinates.family, coordinates.active
     if isinstance(family, ProductFamily):
         rows = ProductRows.build(family, coordinates.theta)
@@ -243,25 +243,24 @@ def _build_coordinate_rows(coordinates: Coordinates) -> tuple[CoordinateRows | N
 
 @dataclass(frozen=True)
 class TipRows:
-    """The parts of the tip's pose that a task fixes: x(q) = x(p) if and only if they are equal at q and p."""
+    """The parts of the tip's pose that a task fixes: x(q) = x(p) if and only if these parts are equal at q and p."""
 
-    position: tuple[int, ...] = ()  #: axes of the world along which the position counts
-    rotation: bool = False  #: the whole orientation
-    axis: int | None = None  #: the direction of one axis of the tip, unless the whole orientation counts
+    position: tuple[int, ...] = ()  #: world axes along which the position is fixed
+    rotation: bool = False  #: whether the whole orientation is fixed
+    axis: int | None = None  #: axis of the tip whose direction is fixed, unless the whole orientation is
 
     @classmethod
     def build(cls, task: Task) -> "TipRows | None":
-        """Build for a task; None for tasks of other kinds or frames, a tip that does not move, and mimic joints."""
-        # The task's recipe says what it compares.
+        """Build for a task; None for other tasks or frames, for a tip that does not move, and with mimic joints."""
         kind, tree = task.recipe["kind"], task.robot.tree
         if tree.tip_parent < 0 or not task.of_tip or tree.mimic_names:
             return None
-        # Rows of a position, or of some of its components.
+        # Position, or some of its components.
         if kind == "polar":
             return cls((0, 1))
         if kind.startswith("position:"):
             return cls(tuple(map("xyz".index, kind.removeprefix("position:"))))
-        # Rows of an orientation, of a pose, or of one axis.
+        # Orientation, pose, or one axis.
         if (turned := TipTurn.from_kind(kind)) is None:
             return None
         whole = turned.whole or turned.axis is None
@@ -269,9 +268,9 @@ class TipRows:
 
 
 def transform_task_rows(task: Task, domain: Domain) -> tuple[ca.Function, float]:
-    """q (n, 1) -> J_x (m, n), or C(q) J_x with det C > 0 up to an error of the entries, and that error."""
+    """q (n, 1) -> J_x (m, n), or C(q) J_x with det C > 0 up to an error of the entries; and this error."""
     tip, tree = TipRows.build(task), task.robot.tree
-    # Rows of some axes of the world only cannot be rotated.
+    # Rows of only some world axes cannot be rotated.
     if tip is None or tip.position not in ((), (0, 1, 2)):
         return task.jacobian_function, 0.0
     q = ca.SX.sym("q", task.robot.n)
@@ -282,14 +281,14 @@ def transform_task_rows(task: Task, domain: Domain) -> tuple[ca.Function, float]
         parts.append(_choose_sparsest(q, [J[3:, :] for J in rows]))
     if tip.axis is not None:
         parts.append(build_axis_rows(tree, q, tip.axis))
-    # What stored rotations change in an entry: 16 n deviations times the length of the chain.
+    # Effect of stored rotations on an entry: 16 n deviations times the length of the chain.
     error = 16 * (tree.n + 1) * bound_rotation_error(tree) * bound_reach(tree, domain)
     return dense_function("task_rows", [q], [ca.vertcat(*parts)]), error
 
 
 def build_velocity_rows(tree: KinematicTree, q: ca.SX, body: int) -> ca.SX:
     """Jacobian of the tip's velocity and angular velocity in the axes of a body of the chain, (6, n)."""
-    # Poses of all bodies in the frame of that one: outwards to the tip, then back to the base.
+    # Poses of all bodies relative to that body: outwards to the tip, then back to the base.
     chain = tree.carriers(tree.tip_parent)
     here = chain.index(body)
     poses: dict[int, Pose] = {body: (ca.SX.eye(3), ca.SX.zeros(3))}
@@ -302,7 +301,7 @@ def build_velocity_rows(tree: KinematicTree, q: ca.SX, body: int) -> ca.SX:
         rotation, shift = _build_step(tree, q, i)
         back = R @ rotation.T
         poses[below] = (back, p - back @ shift)
-    # Turning joints move the tip about their axes, sliding ones along.
+    # Turning joints move the tip about their axes, sliding joints along them.
     R, p = poses[tree.tip_parent]
     tip = p + R @ constant(tree.tip_translation)
     J = ca.SX(6, tree.n)
@@ -317,7 +316,7 @@ def build_velocity_rows(tree: KinematicTree, q: ca.SX, body: int) -> ca.SX:
 
 def build_axis_rows(tree: KinematicTree, q: ca.SX, axis: int) -> ca.SX:
     """Jacobian of the direction of a tip axis, along the two other axes of the tip, (2, n)."""
-    # The axis (3,) and the two others (3, 2) in the frame of the body that carries the tip.
+    # Directions of the axis (3,) and of the two others (3, 2) in the frame of the body that carries the tip.
     own, others = tree.tip_rotation[:, axis], tree.tip_rotation[:, [k for k in range(3) if k != axis]]
     J = build_velocity_rows(tree, q, tree.tip_parent)[3:, :]
     along = ca.horzcat(*[ca.cross(J[:, i], ca.SX(ca.DM(own))) for i in range(tree.n)])
@@ -325,14 +324,14 @@ def build_axis_rows(tree: KinematicTree, q: ca.SX, axis: int) -> ca.SX:
 
 
 def bound_rotation_error(tree: KinematicTree) -> float:
-    """A bound of how far a stored rotation, or one in floating-point numbers, is from a rotation."""
+    """Upper bound of the deviation of stored or computed rotation matrices from exact rotations."""
     stored = np.concatenate([tree.rotations, tree.tip_rotation[None]])
     squares = stored.transpose(0, 2, 1) @ stored - np.eye(3)
     return 3 * float(np.abs(squares).max()) + 32 * UNIT
 
 
 def bound_reach(tree: KinematicTree, domain: Domain) -> float:
-    """A bound of the distance of the tip from any joint's origin on the box of a domain [m], plus 1."""
+    """Upper bound of the distance from any joint's origin to the tip on the box of a domain [m], plus 1."""
     furthest = np.abs(domain.centre) + domain.half_width
     slides = float(furthest[np.array(tree.prismatic)].sum())
     return float(np.abs(tree.translations).sum() + np.abs(tree.tip_translation).sum()) + slides + 1.0
@@ -352,12 +351,12 @@ def _build_step(tree: KinematicTree, q: ca.SX, i: int) -> Pose:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Derivatives:
-    """The derivatives of one order of all coordinates, as sums of a few basis functions."""
+    """Derivatives of one order of all coordinates, as sums of a few basis functions."""
 
-    used: NDArray[np.intp]  #: numbers of the basis functions
+    used: NDArray[np.intp]  #: indices of the basis functions
     table: Array  #: (multi-indices * r, used)
-    sizes: Array  #: bounds of what the entries are sums of, same shape
-    rounding: float  #: relative error of entries and of sums with them
+    sizes: Array  #: upper bounds of the terms of the entries, same shape
+    rounding: float  #: relative error of entries and of sums over them
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -365,17 +364,17 @@ class ProductRows:
     """J_xi of a product family on boxes."""
 
     r: int
-    terms: Array  #: (1 + K, n): the one-joint function of each joint
-    functions: TaylorGraph  #: q -> the one-joint functions that are not constant
-    numbers: Array  #: (n, functions of one joint): where each is among them
+    terms: Array  #: (1 + K, n): for each term, the index of the one-joint function of each joint
+    functions: TaylorGraph  #: q -> all one-joint functions that are not constant
+    numbers: Array  #: (n, functions of one joint): index of each function in `functions`
     orders: tuple[Derivatives, ...]  #: from order 1 on
 
     @classmethod
     def build(cls, family: ProductFamily, theta: Array, highest: int = DEGREE + 2) -> "ProductRows":
-        """The tables of a family with its parameters."""
+        """Tabulate a family with its parameters."""
         n, r = family.space.n, family.outputs
         terms = np.array([(0,) * n, *family.terms])
-        # The functions of one joint each, of which all others are products.
+        # Terms of a single joint, from whose functions all terms are products.
         alone = np.flatnonzero(np.count_nonzero(terms, axis=1) == 1)
         q = ca.SX.sym("q", n)
         functions = family.basis(q)[[int(k) - 1 for k in alone]]
@@ -384,14 +383,15 @@ class ProductRows:
             joint = int(np.flatnonzero(terms[k])[0])
             numbers[joint, terms[k, joint]] = place
         graph = TaylorGraph.build(dense_function("functions", [q], [functions]), "the coordinates")
-        # Derivatives of functions are sums of others, so those of the coordinates are tables, order by order.
+        # Derivatives of basis functions are sums of basis functions, so derivatives of coordinates are tables, one per
+        # order.
         steps = [family.build_derivative_matrix(i) for i in range(n)]
         C = np.hstack([np.zeros((r, 1)), theta.reshape(r, -1)])
         tables: dict[Monomial, tuple[Any, Any]] = {(): (C, np.abs(C))}
         orders: list[Derivatives] = []
         for order in range(1, highest + 1):
             indices = list_multi_indices(n, order)
-            # The derivatives of a polynomial of a lower degree vanish.
+            # Derivatives of higher order than the polynomial's degree vanish.
             if orders and not len(orders[-1].used):
                 nothing = np.zeros((len(indices) * r, 0))
                 orders.append(Derivatives(orders[-1].used, nothing, nothing, 0.0))
@@ -408,12 +408,12 @@ class ProductRows:
 
     def __call__(self, boxes: list[TaylorModel], half_widths: Array, variables: Variables) -> TaylorModel:
         """J_xi, (r, n, boxes), for models of the joints on boxes of the given half-widths (n, boxes)."""
-        # Taylor's series: derivatives at the centre, and the next order on the whole box for the remainder.
-        # Values of the basis at the centres, with their errors.
+        # Taylor series: derivatives at the centre, and the next order on the whole box for the remainder. Start with
+        # the values of the basis at the centres, and their errors.
         points = [TaylorModel.constant(box.centre) for box in boxes]
         values, errors = self._evaluate_basis(self.functions(points))
         parts, left_out = [], np.zeros((self.r, len(boxes), half_widths.shape[1]))
-        # Derivatives up to the degree of the models; the next one bounds what they leave out.
+        # Use derivatives up to the degree of the models; the next order bounds the truncation error.
         for order in range(1, DEGREE + 2):
             derivatives, doubt = self._evaluate_derivatives(order, values, errors)
             weights = compute_powers(half_widths, order - 1)
@@ -426,18 +426,18 @@ class ProductRows:
 
     def find_dependences(self) -> set[int]:
         """The joints that J_xi depends on."""
-        # The second derivatives of the coordinates are those of J_xi.
+        # Second derivatives of the coordinates are first derivatives of J_xi.
         changing = self.orders[1]
         indices = list_multi_indices(self.terms.shape[1], 2)
         sizes = np.asarray(changing.sizes.reshape(len(indices), self.r * len(changing.used)).any(axis=1))
         return {i for index, there in zip(indices, sizes.tolist(), strict=True) if there for i in index}
 
     def build_jets(self, around: Around) -> Jets:
-        """The derivatives of J_xi at the centres of boxes. The next order, on the whole box, bounds the rest."""
+        """The derivatives of J_xi at centres of boxes; the next order on the whole box bounds the truncation error."""
         points = [TaylorModel.constant(np.ascontiguousarray(c)) for c in around.centre]
         values, errors = self._evaluate_basis(self.functions(points))
         orders = [self._evaluate_derivatives(order, values, errors) for order in range(1, around.order + 2)]
-        # What is left out: the next order anywhere between the points.
+        # Truncation error: the next order anywhere between the points.
         linear = np.stack([around.centre, around.reach, *np.zeros((2, *around.centre.shape))], axis=1)
         boxes = [TaylorModel((k,), each, np.zeros(each.shape[1:])) for k, each in enumerate(linear)]
         weights = average_powers(build_power_weights(around, around.order + 1), of_size=True)
@@ -446,16 +446,16 @@ class ProductRows:
         return Jets(derivatives, doubts, left_out.sum(axis=2) * compute_margin(left_out.shape[2]) + TINY)
 
     def _evaluate_derivatives(self, order: int, values: Array, errors: Array) -> tuple[Array, Array]:
-        """Derivatives of J_xi at points, of one order less, and bounds of their errors."""
+        """Derivatives of J_xi of order `order` - 1 at points, and error bounds."""
         one = self.orders[order - 1]
         derivatives = one.table @ values[one.used]
         doubt = one.sizes @ (errors[one.used] + one.rounding * np.abs(values[one.used]))
         return self._spread(derivatives, order), self._spread(doubt * compute_margin(len(one.used)), order)
 
     def _bound_derivatives(self, order: int, boxes: list[TaylorModel]) -> Array:
-        """Bounds of the derivatives of J_xi of one order less on boxes, (r, n, multi-indices, boxes)."""
+        """Upper bounds of the derivatives of J_xi of order `order` - 1 on boxes, (r, n, multi-indices, boxes)."""
         last = self.orders[order - 1]
-        # Without other functions, there are constants only.
+        # If no other function is used, all are constants.
         if last.used.any():
             highest = self._multiply_functions([box.bound_magnitude() for box in self.functions(boxes)], last.used)
         else:
@@ -463,13 +463,13 @@ class ProductRows:
         return self._spread(last.sizes @ highest * (1 + last.rounding) * compute_margin(len(last.used)), order)
 
     def _spread(self, derivatives: Array, order: int) -> Array:
-        """Derivatives by multi-index as those of J_xi: (r, n, multi-indices of one order less, boxes)."""
+        """Rearrange derivatives of xi as those of J_xi: (r, n, multi-indices of one order less, boxes)."""
         n, boxes = self.terms.shape[1], derivatives.shape[1]
         values: Array = derivatives.reshape(-1, self.r, boxes)[find_neighbours(n, order)].transpose(2, 0, 1, 3)
         return values
 
     def _evaluate_basis(self, functions: list[TaylorModel]) -> tuple[Array, Array]:
-        """Basis functions at points, (1 + K, boxes), and bounds of their errors."""
+        """Basis functions at points, (1 + K, boxes), and error bounds."""
         every = np.arange(len(self.terms))
         values = self._multiply_functions([model.centre for model in functions], every)
         size = self._multiply_functions([np.abs(model.centre) for model in functions], every)
@@ -494,12 +494,12 @@ class NetworkRows:
     layers: tuple[tuple[Array, Array], ...]  #: weights (out, in) and biases (out,)
     turning: list[int]  #: joints that enter as sine and cosine
     direct: list[int]  #: joints that enter as q itself
-    slopes: Array  #: A of all joints, (r, n); 0 for those of the network
+    slopes: Array  #: A for all joints, (r, n); 0 for joints of the network
     activation: str  #: a
 
     @classmethod
     def build(cls, family: MLPFamily, theta: Array) -> "NetworkRows":
-        """The layers of a family with its parameters."""
+        """Read the layers of a family with its parameters."""
         layers = tuple((V.T.copy(), b) for V, b in zip(*split_layers(theta, family.widths), strict=True))
         slopes = np.zeros((family.outputs, family.space.n))
         slopes[:, list(family.linear)] = family.split_slopes(theta)
@@ -525,7 +525,7 @@ class NetworkRows:
             gradient = TaylorModel.constant(weights[:, None])
             for (W, _), slope in zip(self.layers[-2::-1], slopes[::-1], strict=True):
                 gradient = _multiply_weights(W.T, gradient * slope)
-            # By the joints, from derivatives by the inputs [sin q; cos q; q].
+            # Derivatives by the joints, from derivatives by the inputs [sin q; cos q; q].
             turning, columns = len(sines), [TaylorModel.constant(np.full(1, value)) for value in constants]
             for k, i in enumerate(self.turning):
                 columns[i] = gradient[k] * cosines[k] - gradient[turning + k] * sines[k]

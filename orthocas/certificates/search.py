@@ -1,4 +1,4 @@
-"""Branch and bound: check boxes, and halve those on which nothing is proved, the largest first."""
+"""Branch and bound: check boxes, the largest first, and halve those without a proof."""
 
 import heapq
 import logging
@@ -20,12 +20,12 @@ from orthocas.tools.processes import ATTEMPTS, worker_died
 
 @dataclass(frozen=True, slots=True)
 class SearchRules:
-    """How boxes are shared between workers."""
+    """How boxes are distributed to workers."""
 
-    batch: int = 512  #: most boxes of one task
-    small: int = 128  #: boxes; smaller tasks take longer for each
-    tasks: int = 8  #: that the waiting boxes are cut into if they are few
-    in_flight: int = 64  #: most tasks of an executor at a time
+    batch: int = 512  #: largest number of boxes per task
+    small: int = 128  #: smallest useful number of boxes; smaller tasks cost more per box
+    tasks: int = 8  #: tasks to form if few boxes are waiting
+    in_flight: int = 64  #: largest number of tasks in an executor at a time
 
 
 RULES = SearchRules()
@@ -36,41 +36,42 @@ Look = Callable[["Search"], None]  #: called after each batch
 
 @dataclass(frozen=True)
 class Limits:
-    """When a search ends before all is proved."""
+    """When a search ends before everything is proved."""
 
     seconds: float = np.inf
     boxes: int = MOST_BOXES // 4
-    smallest: float = 2.0**-12  #: fraction of the width of the whole below which a joint's interval is not halved
-    hopeless: int = MOST_BOXES  #: boxes after which the search ends if the rest would take more than `boxes`
+    smallest: float = 2.0**-12  #: a joint's interval is not halved below this fraction of the whole width
+    hopeless: int = MOST_BOXES  #: after this many boxes, the search ends if it is expected to need more than `boxes`
 
 
 @dataclass(eq=False)
 class Search:
-    """A search in progress: the tree of boxes, and those still to check."""
+    """A search in progress: the tree of boxes, and the boxes still to check."""
 
     check: BoxCheck
-    base: Subdivision  #: its open parts are searched
+    base: Subdivision  #: the search works on its open parts
     limits: Limits
     executor: Executor | None = None
     evaluated: int = 0
-    proved_volume: float = 0.0  #: fraction of the whole
-    open_count: int = 0  #: number of boxes where nothing is proved so far
-    conditioning: float = np.inf  #: least of the lower bounds on proved boxes
-    signs: dict[int, Array] = field(default_factory=dict)  #: sign of det J -> a point with that sign
+    proved_volume: float = 0.0  #: proved fraction of the whole volume
+    open_count: int = 0  #: number of boxes without a proof so far
+    conditioning: float = np.inf  #: smallest lower bound on proved boxes
+    signs: dict[int, Array] = field(default_factory=dict)  #: sign of det J -> a point with this sign
     _codes: list[int] = field(default_factory=list)
-    _children: list[int] = field(default_factory=list)  #: place of the lower half; the upper half follows
-    _waiting: list[tuple[float, int, Array, Array]] = field(default_factory=list)  #: a heap
-    _deaths: Counter[int] = field(default_factory=Counter)  #: of processes, by the places of their boxes
+    #: index of the lower half of each box; the upper half follows it
+    _children: list[int] = field(default_factory=list)
+    _waiting: list[tuple[float, int, Array, Array]] = field(default_factory=list)  #: a heap of boxes to check
+    _deaths: Counter[int] = field(default_factory=Counter)  #: number of died processes, by the indices of their boxes
 
     def __post_init__(self) -> None:
         low, high = self.base.leaves(OPEN)
-        # A search that goes on begins with what an earlier one has proved.
+        # A resumed search starts with the volume that is already proved.
         self.proved_volume = self.base.share
         self._add(low, high)
 
     @property
     def folded(self) -> bool:
-        """Whether det J was found with both signs."""
+        """Whether det J has both signs."""
         return len(self.signs) == 2
 
     @property
@@ -79,26 +80,26 @@ class Search:
         return OPEN not in self._codes and not self.folded
 
     def run(self, look: Look) -> None:
-        """Search until all is proved, a fold shows, or a limit is reached. An interrupted search keeps its state."""
+        """Search until all is proved, a fold is found, or a limit is reached. An interrupted search keeps its state."""
         end = time.monotonic() + self.limits.seconds
         pending: dict[Future[BoxResults], list[tuple[float, int, Array, Array]]] = {}
         try:
             while self._waiting or pending:
-                # A fold ends the search, a limit, and a pace at which all would take too many boxes.
+                # End at a fold, at a limit, or if the pace shows that the search would need too many boxes.
                 hopeless = self.evaluated > max(self.limits.hopeless, self.proved_volume * self.limits.boxes)
                 if self.folded or time.monotonic() > end or self.evaluated >= self.limits.boxes or hopeless:
                     break
                 self._step(pending)
                 look(self)
         finally:
-            # Batches that nobody has finished wait again.
+            # Unfinished batches wait again.
             for future, batch in pending.items():
                 future.cancel()
                 self._return(batch)
 
     def visit(self, points: Array) -> None:
-        """Note the signs of det J at points (k, n), where they are proved."""
-        # A point is a box without width.
+        """Record the signs of det J at points (k, n), where they are proved."""
+        # A point is a box of zero width.
         results = self.check(points, points)
         for point, regular, sign in zip(points, results.regular, results.sign.tolist(), strict=True):
             if regular and sign:
@@ -112,7 +113,7 @@ class Search:
             if code != OPEN:
                 codes.append(code)
                 continue
-            # The tree below an open part of the base, each box before its halves.
+            # Build the tree below an open part of the base; each box comes before its halves.
             waiting, root = [root], root + 1
             while waiting:
                 place = waiting.pop()
@@ -122,9 +123,9 @@ class Search:
         return Subdivision(self.base.low, self.base.high, np.array(codes, dtype=np.uint8))
 
     def _step(self, pending: dict[Future[BoxResults], list[tuple[float, int, Array, Array]]]) -> None:
-        """Evaluate one batch here, or give batches to the executor and take back those that are done."""
+        """Evaluate one batch in this process, or exchange batches with the executor."""
         check_remembered()
-        # Without an executor, one batch is evaluated here; Ctrl-C gives it back.
+        # Without an executor, evaluate one batch here; after Ctrl-C it waits again.
         if self.executor is None:
             batch = self._take()
             try:
@@ -134,20 +135,22 @@ class Search:
                 raise
             self._apply(batch, results)
             return
-        # Keep the executor busy, and take back what it has evaluated.
+        # Keep the executor busy, and collect results.
         while self._waiting and len(pending) < RULES.in_flight:
             batch = self._take()
             try:
                 pending[self.executor.submit(self.check, *_stack_corners(batch))] = batch
             except BrokenExecutor:
-                raise CertifyError("the executor cannot be used any more: one of its processes died") from None
+                raise CertifyError(
+                    "the executor is broken, because one of its processes died: create a new one"
+                ) from None
         done = wait(pending, return_when=FIRST_COMPLETED).done
         for future in done:
             batch = pending.pop(future)
             if not worker_died(future):
                 self._apply(batch, future.result())
                 continue
-            # Boxes whose process died are tried again; after the last attempt they stay open.
+            # Retry boxes whose process died; after the last attempt they stay open.
             self._deaths.update(place for _, place, _, _ in batch)
             given_up = [box for box in batch if self._deaths[box[1]] >= ATTEMPTS]
             self._return([box for box in batch if self._deaths[box[1]] < ATTEMPTS])
@@ -155,7 +158,7 @@ class Search:
                 _log.warning("%d boxes are left unproved: worker processes died over them", len(given_up))
 
     def _take(self) -> list[tuple[float, int, Array, Array]]:
-        # As many boxes as there are, but enough tasks for all workers of an executor.
+        # Take many boxes, but form enough tasks for all workers of an executor.
         waiting = len(self._waiting)
         if self.executor is not None:
             waiting = max(waiting // RULES.tasks, min(RULES.small, waiting))
@@ -169,12 +172,12 @@ class Search:
         """Close the boxes that are proved, and halve the others."""
         low, high = _stack_corners(batch)
         self.evaluated += len(batch)
-        # Signs at the centres of boxes without a proof are hints: visit one point for each sign that is new.
+        # Signs at centres of boxes without a proof are only hints, so check one point for each new sign.
         for sign in {-1, 1} - set(self.signs):
             there = np.flatnonzero(results.sign == sign)
             if there.size:
                 self.visit((low + high)[there[:1]] / 2)
-        # Proved boxes are closed, all others are halved.
+        # Close proved boxes, and halve all others.
         proved = results.proved
         if proved.any():
             self.conditioning = min(self.conditioning, float(results.conditioning[proved].min()))
@@ -186,13 +189,14 @@ class Search:
                 continue
             widths = (b - a) / (self.base.high - self.base.low)
             joint = int(results.widest[k])
-            # Where bounds are infinite, halve the relatively widest joint: a choice that stays the same may never help.
+            # If bounds are infinite, halve the relatively widest joint. Halving the same joint each time might never
+            # help.
             if joint == UNKNOWN:
                 joint = max(self.check.joints, key=lambda i: float(widths[i]))
-            # Boxes too small to halve, or of no use to halve, stay open.
+            # Boxes stay open if they are too small, or if halving is useless.
             if joint == NEVER or widths[joint] <= self.limits.smallest:
                 continue
-            # The halves take the place of the box.
+            # Replace the box by its halves.
             top, bottom = b.copy(), a.copy()
             top[joint] = bottom[joint] = halve_interval(a[joint], b[joint])
             self._codes[place], self._children[place] = joint, len(self._codes)
@@ -200,7 +204,7 @@ class Search:
             self._add(np.array([a, bottom]), np.array([top, b]))
 
     def _add(self, low: Array, high: Array) -> None:
-        # New boxes are open, and wait, the largest first.
+        # New boxes wait, the largest first.
         self.open_count += len(low)
         for volume, a, b in zip(_measure_volumes(self.base, low, high).tolist(), low, high, strict=True):
             heapq.heappush(self._waiting, (-volume, len(self._codes), a, b))
@@ -209,7 +213,7 @@ class Search:
 
 
 def _measure_volumes(base: Subdivision, low: Array, high: Array) -> Array:
-    # As fractions of the whole.
+    # Relative to the whole volume.
     return np.asarray(((high - low) / (base.high - base.low)).prod(axis=1))
 
 

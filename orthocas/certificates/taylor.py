@@ -1,7 +1,7 @@
-"""Taylor models: polynomials with a remainder that covers truncation and rounding; and functions of them.
+"""Taylor models, which are polynomials with a remainder for truncation and rounding, and functions of them.
 
-A model of f on a box has f(c + h t) = sum_a c_a t^a + e for t in [-1, 1]^n, |a| <= 3, and |e| <= the remainder. Sums
-and products carry the remainders of their operands, the terms that they cut off, and all roundings.
+A model of f on a box has f(c + h t) = sum_a c_a t^a + e for t in [-1, 1]^n, |a| <= 3, with |e| <= the remainder. The
+remainders of sums and products include those of the operands, all truncated terms, and all rounding.
 
 Source:
     ours, docs/explanation/certificates.md.
@@ -20,32 +20,33 @@ from numpy.typing import NDArray
 from orthocas.tools.checks import Array
 
 UNIT = 2.0**-53  #: u: relative error of one operation
-UP = 1.0 + 2.0**-40  #: factor on bounds, for up to 4,000 roundings of non-negative numbers
-TINY = 1e-290  #: larger than all underflow of one operation on arrays of numbers up to 1e10
+UP = 1.0 + 2.0**-40  #: factor on upper bounds that covers up to 4,000 roundings of non-negative numbers
+TINY = 1e-290  #: exceeds the underflow of one operation on arrays of numbers up to 1e10
 DEGREE = 3
-_PRODUCTS = 8  #: that add up to a coefficient of a product: a_S b_rest over the subsets S of three variables
-Variables = tuple[int, ...]  #: increasing numbers of variables
-Monomial = tuple[int, ...]  #: its variables in increasing order, repeated for powers
-Places = slice | NDArray[np.intp]  #: where coefficients go
-#: pi / 2 and ln 2 in pieces: the first ones are so short that products with whole numbers up to 2^20 are exact
+#: number of products that a coefficient of a product sums: a_S b_rest over the subsets S of three variables
+_PRODUCTS = 8
+Variables = tuple[int, ...]  #: indices of variables, increasing
+Monomial = tuple[int, ...]  #: variables in increasing order, repeated for powers
+Places = slice | NDArray[np.intp]  #: indices of coefficients
+#: pi / 2 and ln 2 in pieces; the first pieces are short, so that products with integers up to 2^20 are exact
 _HALF_PI = tuple(map(float.fromhex, ("0x1.921fb54000000p+0", "0x1.10b4611800000p-30", "0x1.313198a2e0370p-61")))
 _LN2 = tuple(map(float.fromhex, ("0x1.62e42fefa0000p-1", "0x1.cf79abc9e3b39p-40")))
 _WIDEST_ANGLE, _WIDEST_EXPONENT = 1e6, 700.0
-_ERROR = 32 * UNIT  #: reduction 3 u, Horner's rule below 8 u, the rest of the series below 1e-4 u
-_ROUNDINGS = 16 * UNIT  #: relative error of a few operations in a row
+_ERROR = 32 * UNIT  #: error bound: reduction 3 u, Horner's rule below 8 u, truncation of the series below 1e-4 u
+_ROUNDINGS = 16 * UNIT  #: relative error of a few consecutive operations
 _TANH = 6.2 / 24  #: |tanh''''| = 8 |t| (1 - t^2) |2 - 3 t^2| < 8 * 0.385 * 2 for t = tanh x in [-1, 1]
-POWERS = ("pow", "constpow")  #: with a whole constant exponent
+POWERS = ("pow", "constpow")  #: powers with an integer constant exponent
 Enclosed = tuple[Array, Array]  #: values, and bounds of their absolute errors
 
 
 def sum_error(products: int) -> float:
-    """Error of a sum of so many products, relative to the sum of their absolute values; 8 roundings are to spare."""
+    """Error of a sum of so many products, relative to the sum of their absolute values, with 8 spare roundings."""
     # k u / (1 - k u) < 1.01 k u for k below 10^13.
     return 1.01 * (products + 8) * UNIT
 
 
 def compute_margin(products: int) -> float:
-    """The factor on bounds that are sums of so many products of non-negative numbers."""
+    """Factor that makes a computed sum of so many products of non-negative numbers an upper bound."""
     return UP * (1 + sum_error(products))
 
 
@@ -58,40 +59,40 @@ def list_monomials(variables: Variables, degree: int = DEGREE) -> tuple[Monomial
 
 @cache
 def find_order_starts(count: int) -> tuple[int, ...]:
-    """Where the monomials of degree 0, 1, 2, 3 in so many variables start, and how many there are in all."""
+    """Index of the first monomial of each degree 0, 1, 2, 3 in so many variables, and the number of all monomials."""
     linear, quadratic = 1 + count, (1 + count) * (2 + count) // 2
     return 0, 1, linear, quadratic, quadratic * (3 + count) // 3
 
 
 @cache
 def find_places(part: Variables, whole: Variables) -> Places:
-    """Where the monomials of some of the variables stand among those of all."""
+    """Indices of the monomials of some of the variables among the monomials of all variables."""
     index = {monomial: k for k, monomial in enumerate(list_monomials(whole))}
     return _merge_places([index[monomial] for monomial in list_monomials(part)])
 
 
 @dataclass(frozen=True, slots=True)
 class Product:
-    """How to multiply two polynomials a and b, cut off after degree 3."""
+    """Plan for multiplying two polynomials a and b, truncated after degree 3."""
 
-    variables: Variables  #: of the product
+    variables: Variables  #: variables of the product
     size: int  #: number of coefficients of the product
-    left: Places  #: of a's monomials
-    right: Places  #: of b's monomials
-    by_linear: tuple[Places, ...]  #: of a's linear monomials times b's linear and quadratic ones
-    quadratic_by: tuple[Places, ...]  #: of a's quadratic monomials times b's linear ones
+    left: Places  #: indices of a's monomials in the product
+    right: Places  #: indices of b's monomials in the product
+    by_linear: tuple[Places, ...]  #: indices of products of a's linear monomials with b's linear and quadratic ones
+    quadratic_by: tuple[Places, ...]  #: indices of products of a's quadratic monomials with b's linear ones
 
 
 @cache
 def plan_product(left: Variables, right: Variables) -> Product:
-    """The table for polynomials in the given variables."""
+    """The plan for polynomials in the given variables."""
     both = tuple(sorted({*left, *right}))
     index = {monomial: k for k, monomial in enumerate(list_monomials(both))}
 
     def find_products(one: Monomial, others: tuple[Monomial, ...]) -> Places:
         return _merge_places([index[tuple(sorted(one + other))] for other in others])
 
-    # Linear terms of a meet linear and quadratic ones of b, quadratic ones of a only linear ones.
+    # Linear terms of a multiply linear and quadratic terms of b; quadratic terms of a multiply only linear ones.
     a, b = list_monomials(left), list_monomials(right)
     starts = find_order_starts(len(left))
     inner = b[1 : find_order_starts(len(right))[3]]
@@ -106,7 +107,7 @@ def plan_product(left: Variables, right: Variables) -> Product:
 
 
 def _merge_places(indices: list[int]) -> Places:
-    """A slice where the indices follow each other."""
+    """A slice if the indices are consecutive, otherwise an array."""
     if indices and indices == list(range(indices[0], indices[-1] + 1)):
         return slice(indices[0], indices[-1] + 1)
     return np.array(indices, dtype=np.intp)
@@ -114,15 +115,15 @@ def _merge_places(indices: list[int]) -> Places:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class TaylorModel:
-    """Models of functions on boxes: any shape of functions first, boxes last."""
+    """Models of functions on boxes; the shape of the functions comes first, and the boxes last."""
 
-    variables: Variables  #: the variables it depends on
+    variables: Variables  #: variables of the models
     coefficients: Array  #: (monomials, ..., boxes), in the order of `list_monomials`
     remainder: Array  #: (..., boxes), >= 0
 
     @classmethod
     def constant(cls, values: Array, error: Array | float = 0.0) -> Self:
-        """Numbers (..., boxes) known up to an error."""
+        """Models of numbers (..., boxes) that are known up to an error."""
         return cls((), values[None], np.broadcast_to(error, values.shape))
 
     @property
@@ -139,7 +140,7 @@ class TaylorModel:
         return np.asarray(np.add.reduceat(size, starts, axis=0))
 
     def bound_magnitude(self) -> Array:
-        """A bound of the absolute values, (..., boxes)."""
+        """Upper bound of the absolute values, (..., boxes)."""
         return np.asarray((np.abs(self.coefficients).sum(axis=0) + self.remainder) * UP)
 
     def __getitem__(self, part: object) -> "TaylorModel":
@@ -155,7 +156,7 @@ class TaylorModel:
         return TaylorModel(variables, wide, self.remainder)
 
     def broadcast_to(self, shape: tuple[int, ...]) -> "TaylorModel":
-        """The same model for functions and boxes of another shape, to which its own is broadcast."""
+        """The same models, broadcast to another shape of functions and boxes."""
         wide = np.broadcast_to(self.coefficients, (len(self.coefficients), *shape))
         return TaylorModel(self.variables, wide, np.broadcast_to(self.remainder, shape))
 
@@ -194,7 +195,7 @@ class TaylorModel:
             out[where] += a[i] * b[1:end]
         for j, where in enumerate(table.quadratic_by, 1):
             out[where] += b[j] * a[starts[2] : starts[3]]
-        # The remainder: degrees above 3, the remainders of the factors, and rounding, from their sizes by degree.
+        # The remainder covers degrees above 3, the remainders of the factors, and rounding.
         a, b = self.sum_sizes(), other.sum_sizes()
         all_a, all_b = a.sum(axis=0), b.sum(axis=0)
         high = a[3] * (b[1] + b[2] + b[3]) + a[2] * (b[2] + b[3]) + a[1] * b[3]
@@ -210,26 +211,26 @@ class TaylorModel:
 
     def compose(self, series: "Series") -> "TaylorModel":
         """The model of f(self), for the series of f about the centre."""
-        # Without variables, the remainder takes the place of all that varies.
+        # Without variables, the variation of f over the remainder is all error.
         if not self.variables:
             first = np.abs(series.values[1:]) + series.errors[1:]
             e = self.remainder
             doubt = series.errors[0] + series.tail + e * (first[0] + e * (first[1] + e * first[2]))
             return TaylorModel.constant(series.values[0], doubt * UP)
-        # Horner's rule in what is away from the centre.
+        # Horner's rule in the deviation from the centre.
         away = TaylorModel(self.variables, self.coefficients.copy(), self.remainder)
         away.coefficients[0] = 0
         values = [TaylorModel.constant(series.values[k], series.errors[k]) for k in range(4)]
         return _widen(((values[3] * away + values[2]) * away + values[1]) * away + values[0], series.tail)
 
     def bound_deviation(self) -> Array:
-        """A bound of the distance from the centre, (..., boxes)."""
+        """Upper bound of the distance from the centre, (..., boxes)."""
         return np.asarray((np.abs(self.coefficients[1:]).sum(axis=0) + self.remainder) * UP)
 
     def compute_gains(self) -> Array:
-        """How much halving the interval of each variable takes from the bound of the values, (variables, ..., boxes).
+        """How much halving the interval of each variable improves the bound of the values, (variables, ..., boxes).
 
-        A coefficient shrinks by 2^-power; the remainder is shared out like the cubic terms, which it is most like.
+        A coefficient shrinks by 2^-power. The remainder is distributed like the cubic terms, which it resembles most.
         """
         taken, size = weigh_halving(self.variables, DEGREE), np.abs(self.coefficients)
         cubic = find_order_starts(len(self.variables))[3]
@@ -252,7 +253,7 @@ def weigh_halving(variables: Variables, degree: int) -> Array:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Series:
-    """f(x + e) = sum_k values[k] e^k up to errors[k], and a rest of at most `tail` for the e in question."""
+    """f(x + e) = sum_k values[k] e^k, values exact up to errors[k], with a truncation error of at most `tail`."""
 
     values: Array  #: (4, ..., boxes)
     errors: Array  #: (4, ..., boxes)
@@ -261,7 +262,7 @@ class Series:
 
 def stack(models: list[TaylorModel]) -> TaylorModel:
     """Models of the same shape as one, with a new first axis."""
-    # All models get the variables and the shape that they have together.
+    # Extend all models to the union of their variables, and to a common shape.
     variables = tuple(sorted({v for model in models for v in model.variables}))
     shape = np.broadcast_shapes(*(model.remainder.shape for model in models))
     parts = [model.broadcast_to(shape).extend(variables) for model in models]
@@ -274,17 +275,17 @@ def _widen(model: TaylorModel, error: Array) -> TaylorModel:
 
 
 def evaluate_sine_cosine(x: Array) -> tuple[Enclosed, Enclosed]:
-    """Sine and cosine of numbers up to 1e6 in size."""
+    """Sine and cosine of numbers of absolute value up to 1e6."""
     valid = np.abs(x) <= _WIDEST_ANGLE
     x = np.where(valid, x, 0.0)
-    # Quarter turns are taken off, then the two series follow.
+    # Subtract quarter turns, then evaluate both series.
     turns = np.rint(x * (2 / np.pi))
     # |r| < 0.79.
     r = ((x - turns * _HALF_PI[0]) - turns * _HALF_PI[1]) - turns * _HALF_PI[2]
     square = r * r
     s = r * _evaluate_horner(square, [(-1.0) ** k / factorial(2 * k + 1) for k in range(10)])
     c = _evaluate_horner(square, [(-1.0) ** k / factorial(2 * k) for k in range(11)])
-    # Each quarter turn swaps sine and cosine, and one of the signs.
+    # Each quarter turn swaps sine and cosine, and changes one sign.
     quarter = turns % 4
     sine = np.choose(quarter.astype(int), [s, c, -s, -c])
     cosine = np.choose(quarter.astype(int), [c, -s, -c, s])
@@ -293,7 +294,7 @@ def evaluate_sine_cosine(x: Array) -> tuple[Enclosed, Enclosed]:
 
 
 def evaluate_exponential(x: Array) -> Enclosed:
-    """e^x of numbers up to 700 in size."""
+    """e^x for |x| <= 700."""
     valid = np.abs(x) <= _WIDEST_EXPONENT
     x = np.where(valid, x, 0.0)
     whole = np.rint(x * (1 / np.log(2.0)))
@@ -312,7 +313,7 @@ def evaluate_tanh(x: Array) -> Enclosed:
 
 def _evaluate_horner(x: Array, coefficients: list[float]) -> Array:
     """Sum of coefficients[k] x^k."""
-    # From the highest power down.
+    # Start with the highest power.
     value = np.full_like(x, coefficients[-1])
     for coefficient in coefficients[-2::-1]:
         value = value * x + coefficient
@@ -332,7 +333,7 @@ def cosine(model: TaylorModel) -> TaylorModel:
 
 
 def reciprocal(model: TaylorModel) -> TaylorModel:
-    """The model of 1 / f. Nothing is known where f may vanish."""
+    """The model of 1 / f, with an infinite remainder where f may vanish."""
     x, e = model.centre, model.bound_deviation()
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         values = np.stack([1 / x, -1 / (x * x), 1 / (x * x * x), -1 / (x * x * x * x)])
@@ -343,7 +344,7 @@ def reciprocal(model: TaylorModel) -> TaylorModel:
 
 
 def square_root(model: TaylorModel) -> TaylorModel:
-    """The model of sqrt f. Nothing is known where f may be zero or negative."""
+    """The model of sqrt f, with an infinite remainder where f may be zero or negative."""
     x, e = model.centre, model.bound_deviation()
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         root = np.sqrt(x)
@@ -353,7 +354,7 @@ def square_root(model: TaylorModel) -> TaylorModel:
 
 
 def reciprocal_square_root(model: TaylorModel) -> TaylorModel:
-    """The model of 1 / sqrt f. Nothing is known where f may be zero or negative."""
+    """The model of 1 / sqrt f, with an infinite remainder where f may be zero or negative."""
     x, e = model.centre, model.bound_deviation()
     with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
         root = 1 / np.sqrt(x)
@@ -363,7 +364,7 @@ def reciprocal_square_root(model: TaylorModel) -> TaylorModel:
 
 
 def _bound_decreasing(first: float, ratio: Array) -> Array:
-    """The rest of a power series from degree 4 on, if its coefficients decrease from `first` on in size."""
+    """Bound of the tail of a power series from degree 4 on, with coefficients that decrease in size from `first` on."""
     rest: Array = np.where((ratio >= 0) & (ratio < 1 - 1e-9), first * ratio**4 / (1 - ratio * UP), np.inf)
     return rest
 
@@ -395,10 +396,10 @@ def square(model: TaylorModel) -> TaylorModel:
 
 
 def power(model: TaylorModel, exponent_: int) -> TaylorModel:
-    """The model of f^k for a whole number k."""
+    """The model of f^k for an integer k."""
     if exponent_ < 0:
         return reciprocal(power(model, -exponent_))
-    # From the first binary digit on, square for each, and multiply for those that are 1.
+    # For each binary digit, square; for each digit 1, multiply by f.
     result = TaylorModel.constant(np.ones_like(model.centre))
     for bit in bin(exponent_)[2:]:
         result = result * result

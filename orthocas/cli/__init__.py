@@ -15,7 +15,8 @@ def main() -> None:
 
 
 def _run() -> None:
-    from orthocas.cli import entry  # takes milliseconds, in which Ctrl-C may come
+    # Importing this takes milliseconds, in which Ctrl-C may come.
+    from orthocas.cli import entry
 
     entry.open_closed_streams()
     entry.leave_on_ctrl_c()

@@ -1,4 +1,4 @@
-"""`orthocas charts`, `evaluate` and `certify`: ready charts, and what is known of a chart."""
+"""`orthocas charts`, `evaluate` and `certify`: ready charts, and quality and proofs of a chart."""
 
 import os
 import time
@@ -31,7 +31,8 @@ from orthocas.tools.archive import require_free
 from orthocas.tools.checks import require_count
 from orthocas.tools.interrupts import INTERRUPTED
 
-_NOT_PROVED = 1  # exit code
+# Exit code.
+_NOT_PROVED = 1
 
 
 def charts(
@@ -43,7 +44,6 @@ def charts(
     json: AsJson = False,
 ) -> None:
     """List the ready charts of known arms, show the card of one, or write it to a file."""
-    # Without a name, all of them in a table.
     if name is None:
         if out is not None:
             raise OptionError("--out requires the name of a ready chart")
@@ -60,7 +60,7 @@ def charts(
                 rows.append((ready.name, ready.model.robot, sizes, leak, least, ready.model.licence))
             print_table(rows, f"orthocas view {cards[0].name}")
         return
-    # One chart: its card, and its file if that is asked for.
+    # With a name, print its card, and write its file on request.
     ready = card(name)
     if out is not None:
         load(name).save(out, force)
@@ -107,12 +107,13 @@ def certify(
     force: Force = False,
     json: AsJson = False,
 ) -> None:
-    """Prove that a chart does not fold anywhere on its domain, and keep the proof in its file.
+    """Prove that a chart does not fold anywhere on its domain, and save the proof in its file.
 
-    A certificate without a fold that does not cover the domain is resumed. The exit code is 1 if not all is proved,
-    with --check too.
+    An unfinished certificate without a fold is resumed. The exit code is 1 if not everything is proved, also with
+    --check.
     """
-    from orthocas import certificates  # with multiprocessing, long to import, and other commands need neither
+    # multiprocessing takes long to import, and other commands do not need it.
+    from orthocas import certificates
 
     processes = 0 if "://" in workers else require_count("--workers", parse_whole_number(workers))
     target = out or chart
@@ -120,7 +121,7 @@ def certify(
     loaded = load(chart)
     with _start_workers(processes, workers) as executor, terminal_monitor() as monitor:
         start = time.monotonic()
-        # Check the proof in the file, and end.
+        # Check the proof in the file only.
         if check:
             holds = certificates.check_certificate(loaded, executor=executor, monitor=monitor)
             assert loaded.certificate is not None
@@ -133,7 +134,7 @@ def certify(
                 line = f"the certificate {verdict}{partly}, {took:.3g} s"
                 print_rows({"check": line, **loaded.certificate.facts()})
             raise typer.Exit(0 if holds and loaded.certificate.proved else _NOT_PROVED)
-        # Prove, from where the file's certificate stopped; Ctrl-C keeps what is proved so far.
+        # Continue the certificate of the file if possible; Ctrl-C keeps what is proved so far.
         saved = loaded.certificate
         resumable = saved is not None and saved.method in METHODS and saved.digest and not (saved.proved or saved.fold)
         resume = saved if resumable and saved and bound in (None, saved.bound) else None
@@ -164,8 +165,9 @@ def certify(
 
 @contextmanager
 def _start_workers(processes: int, address: str) -> Iterator[Executor | None]:
-    """What shares the work: processes, for 0 of them a Dask scheduler, for one nothing."""
-    from orthocas.tools.processes import Processes, begin_worker, scheduler_executor  # as in `certify`
+    """The executor: local processes, a Dask scheduler if their number is 0, or None if it is 1."""
+    # Slow to import, as in `certify`.
+    from orthocas.tools.processes import Processes, begin_worker, scheduler_executor
 
     if processes == 0:
         with scheduler_executor(address) as executor:

@@ -1,4 +1,4 @@
-"""`orthocas codegen` and `export`: a chart as C or as a Python module; and the options of laws, for `simulate` too."""
+"""`orthocas codegen` and `export`, which write a chart as C or as a Python module, and the options of laws."""
 
 import warnings
 from collections.abc import Callable, Mapping
@@ -26,9 +26,9 @@ _NONE, _TRACK = "none", "track"
 
 
 def add_law_options(for_codegen: bool) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """A decorator of commands: the settings of all laws, as options, take the place of the parameter `settings`.
+    """A decorator of commands: replaces the parameter `settings` by options for the settings of all laws.
 
-    The command gets those that were given, by name, as texts.
+    The command receives a mapping from names to texts, with the options that were given.
     """
     options: dict[str, tuple[Any, None]] = {}
     for law in map(law_of, law_names()):
@@ -76,30 +76,30 @@ def codegen(
     """Write a chart, the robot's dynamics, the inverse map and a controller as C99."""
     if controller == _TRACK:
         if settings or limit is not None or check or single_precision or solids != SolidOptions():
-            raise OptionError(f"--controller {_TRACK} takes --out, --name and --force")
+            raise OptionError(f"--controller {_TRACK} takes no other options than --out, --name and --force")
         _write_tracker(chart, out, name, force, json)
         return
-    # Settings belong to a law.
+    # Settings require a law.
     if controller != _NONE:
         require_settings(controller, settings)
     elif settings or limit is not None:
         raise OptionError("settings of a controller require a controller: --controller is none")
-    # CasADi may lose Ctrl-C while it builds functions
+    # CasADi may lose Ctrl-C while it builds functions.
     with deferred():
         loaded = load(chart)
-        # Raises for grown charts.
+        # Refuse grown charts.
         loaded.function("xi")
         law = None if controller == _NONE else build_controller(controller, loaded, settings, limit)
         model = solids.build_model(loaded.problem.robot)
         capsules = None if model is None else fit_capsules(model)
         generated = generate_c(loaded, out, law, name, force, single_precision=single_precision, capsules=capsules)
         remarks = [] if law is None else [*law.remarks()]
-    # Pairs that no distance in C will ever see are for the user to judge.
+    # List the pairs that the C code does not check, so that the user can judge them.
     if capsules is not None and capsules.dropped:
         pairs = listed([f"{first} and {second}" for first, second in capsules.dropped])
         remarks.append(f"not checked in C, because their capsules touch in every posture tried: {pairs}")
     agreement = check_c(generated, loaded, law) if check else None
-    # What was written, and how far it is from Python.
+    # Report the files, and the differences from Python.
     source = generated.folder / f"{generated.name}.c"
     lines, differences = len(source.read_text().splitlines()), {} if agreement is None else agreement.differences
     if json:
@@ -128,11 +128,12 @@ def codegen(
 
 
 def _write_tracker(file: Path, out: Path, name: str | None, force: bool, json: bool) -> None:
-    """The tracker of an arm file, or of an arm with one chart."""
-    from orthocas.arms.arm import Arm  # with all that arms need, which charts do not
+    """Write the tracker of an arm file, or of a chart as an arm with one chart."""
+    # Imports all modules for arms, which charts do not need.
+    from orthocas.arms.arm import Arm
     from orthocas.arms.arm_file import is_arm
 
-    # A chart is an arm with one chart.
+    # Make an arm of a single chart.
     with deferred():
         if is_arm(file):
             arm = Arm.load(file)
@@ -148,25 +149,25 @@ def _write_tracker(file: Path, out: Path, name: str | None, force: bool, json: b
 
 
 def require_settings(name: str, settings: Mapping[str, str]) -> None:
-    """Check that a controller exists and takes every setting that was given.
+    """Check that a controller exists and has every setting that was given.
 
     Raises:
         UnknownNameError: if there is no such controller.
-        OptionError: for a setting that the controller would ignore.
+        OptionError: for a setting that the controller does not have.
     """
     law = law_of(name)
     for field in settings:
         if field not in law.options:
             takers = _find_laws_with(field)
             option = _name_option(field, law_of(takers[0]).options[field])
-            raise OptionError(f"{name} has no {option}, which belongs to {', '.join(takers)}")
+            raise OptionError(f"{name} has no option {option}, which is for {', '.join(takers)}")
 
 
 def build_controller(name: str, chart: Chart, settings: Mapping[str, str], limit: str | None = None) -> Controller:
-    """Build the controller that a command line describes; `require_settings` has checked the settings.
+    """Build the controller that a command line describes, with settings checked by `require_settings`.
 
     Raises:
-        OrthocasError: if anything does not fit together.
+        OrthocasError: if an argument is invalid or does not fit the chart.
     """
     law = law_of(name)
     values: dict[str, Any] = {}
@@ -174,7 +175,7 @@ def build_controller(name: str, chart: Chart, settings: Mapping[str, str], limit
         setting = law.options[field]
         values[field] = text if setting.is_word else parse_one_or_all(_name_option(field, setting), text)
     with warnings.catch_warnings():
-        # commands print the remarks of the law instead
+        # Commands print the law's remarks instead.
         warnings.simplefilter("ignore", LawWarning)
         return law.on_chart(chart, None if limit is None else parse_one_or_all("--limit", limit), **values)
 

@@ -17,24 +17,24 @@ COMMANDS = {
     "demo": "Fit coordinates for the 7-DoF arm of the paper, print their quality, save a chart and pictures (10 s).",
     "fit": "Fit extra coordinates to a problem and save the chart.",
     "evaluate": "Measure the quality of a chart on held-out samples of its domain.",
-    "certify": "Prove that a chart does not fold anywhere on its domain, and keep the proof in its file.",
+    "certify": "Prove that a chart does not fold anywhere on its domain, and save the proof in its file.",
     "info": "Show a chart, a named problem, or a robot.",
     "compare": "Fit a grid of parametrisations, solvers and seeds; write tables, pictures and charts.",
     "simulate": "Run a controller in a chart's coordinates; write the run, pictures, an animation and a report.",
-    "solve": "Find joint positions with a task value, and xi if it is given. Exit code 1 if there are none.",
+    "solve": "Find joint positions with a given task value and, optionally, xi. Exit code 1 if there are none.",
     "follow": "Follow a tool path; write joint positions, velocities and accelerations on time stamps.",
     "codegen": "Write a chart, the robot's dynamics, the inverse map and a controller as C99.",
     "export": "Write task, xi, phi, Jacobian and inverse of a chart as one Python module that needs the library only.",
     "view": "Show a chart, a robot or a motion in the browser, until Ctrl-C.",
-    "doctor": "Show what is installed, what is missing for what, and whether a first chart works. Exit code 1 if not.",
+    "doctor": "Show installed and missing packages and their uses, and test a first chart. Exit code 1 on failure.",
     "charts": "List the ready charts of known arms, show the card of one, or write it to a file.",
 }  #: names of the commands and the first lines of their help
-_PACKAGE = __package__.partition(".")[0]  #: whose log is shown
+_PACKAGE = __package__.partition(".")[0]  #: package whose log is shown
 _MODULES = {"demo": "compare", "evaluate": "charts", "certify": "charts", "export": "codegen"}
 
 
 def build_app(words: Sequence[str]) -> typer.Typer:
-    """The command line with the commands that `words` name. Of others it knows the help: their imports take time."""
+    """The command line with the commands in `words`. For all others it has only the help, because imports take time."""
     app = typer.Typer(
         name="orthocas",
         help="Joint-space coordinates that a redundant robot's task does not disturb.",
@@ -46,7 +46,7 @@ def build_app(words: Sequence[str]) -> typer.Typer:
     app.callback()(_options)
     for name, summary in COMMANDS.items():
         module = f"{__package__}.{_MODULES.get(name, name)}"
-        # Nothing stands for a command that is not called.
+        # A command that is not called gets a placeholder.
         command = getattr(import_module(module), name) if name in words else lambda: None
         app.command(name, help=None if name in words else summary, short_help=summary)(command)
     return app
@@ -68,7 +68,7 @@ def _options(
 
 
 def run(app: typer.Typer) -> int:
-    """Run a command line. Bad input gives one line on standard error and exit code 2, a signal its own code."""
+    """Run a command line. Bad input gives one line on standard error and exit code 2; a signal gives its own code."""
     with ended_in_order() as ended, remembered() as pressed, warnings.catch_warnings():
         warnings.showwarning = _show_warning
         logging.getLogger(_PACKAGE).addHandler(notes := _Notes())
@@ -77,11 +77,11 @@ def run(app: typer.Typer) -> int:
         except KeyboardInterrupt:
             code = INTERRUPTED
         except Exception as error:
-            # Its message is the help.
+            # The message of this error is the help.
             if type(error).__name__ == "NoArgsIsHelpError":
                 typer.echo(_format_error(error), err=True)
             elif not (pressed() or ended()):
-                # Otherwise it is what a library made of a signal.
+                # A library has wrapped a signal in its own error.
                 line = one_line(_format_error(error))
                 typer.echo(f"orthocas: {line[:1000]}{'...' if len(line) > 1000 else ''}", err=True)
             code = 2
@@ -91,12 +91,12 @@ def run(app: typer.Typer) -> int:
 
 
 def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
-    """Print a warning as a note in one line, those of other libraries too."""
+    """Print a warning as a note in one line, including warnings of other libraries."""
     typer.echo(f"note: {one_line(str(message))}", err=True)
 
 
 class _Notes(logging.Handler):
-    """Prints what the library logs, as warnings."""
+    """Prints the library's log records as notes."""
 
     def emit(self, record: logging.LogRecord) -> None:
         """Print a record of the log as one line."""
@@ -104,22 +104,22 @@ class _Notes(logging.Handler):
 
 
 def _format_error(error: Exception) -> str:
-    """What to say of an error; raises those that are defects."""
+    """The line to print for an error; an error that is a defect of orthocas is raised again."""
     if isinstance(error, typer.TyperException):
-        # Only a command imports the options, so a refusal of one finds them imported.
+        # The options module is loaded if it can have raised this error.
         former = getattr(sys.modules.get(f"{__package__}.options"), "FORMER", {})
         option = getattr(error, "option_name", None)
         return f"no such option: {option}; {former[option]}" if option in former else error.format_message()
     if isinstance(error, OrthocasError):
         return str(error)
     from_library = isinstance(error, OSError | MemoryError) or type(error).__name__ == "LinAlgError"
-    # Also one line, no traceback.
+    # Errors of other libraries also become one line.
     if from_library:
         return f"{type(error).__name__}: {error}"
     raise error
 
 
 def report_interrupt() -> int:
-    """Say that it was Ctrl-C; the exit code."""
+    """Print that Ctrl-C ended the command; returns the exit code."""
     typer.echo("orthocas: interrupted", err=True)
     return INTERRUPTED

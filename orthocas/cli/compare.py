@@ -1,4 +1,4 @@
-"""`orthocas compare` and `demo`: parametrisations and solvers side by side, and the first minute, with pictures."""
+"""`orthocas compare` and `demo`: parametrisations and solvers side by side, and a first example with pictures."""
 
 from pathlib import Path
 from typing import Annotated
@@ -61,12 +61,12 @@ def compare(
     json: AsJson = False,
 ) -> None:
     """Fit a grid of parametrisations, solvers and seeds; write tables, pictures and charts."""
-    # A chart file stands for the problem in it.
+    # A chart file contributes its problem.
     is_name = problem in problems.names() or is_robot_file(problem) or not Path(problem).exists()
     built = ProblemOptions().build_problem(problem) if is_name else load(problem).problem
     parametrisations = [parse_parametrisation(name) for name in param or _PARAMETRISATIONS]
     minimisers: list[Solver] | None = [get_solver(name) for name in solver] if solver else None
-    # the branch that --domain names, that of the problem's centre by default; None without the option
+    # Branch named by --domain, by default the one of the problem's centre; None without the option.
     if domain is None:
         branch = None
     else:
@@ -120,7 +120,8 @@ def write_comparison(comparison: Comparison, folder: Path, force: bool) -> None:
         convergence_figure(comparison).savefig(drafts / "convergence.png", dpi=150)
 
 
-_PAPER = {"task": 2.06, "mutual": 3.44, "minutes": 100.64}  # [AS2023] Sec. 9
+# values of [AS2023] Sec. 9
+_PAPER = {"task": 2.06, "mutual": 3.44, "minutes": 100.64}
 
 
 def demo(

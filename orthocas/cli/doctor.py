@@ -1,4 +1,4 @@
-"""`orthocas doctor`: what is installed, what is missing and for what, and whether it works."""
+"""`orthocas doctor`: lists installed and missing packages, with their uses, and checks that orthocas works."""
 
 import json as json_text
 import platform
@@ -19,7 +19,7 @@ import typer
 
 from orthocas.version import VERSION
 
-# Nothing of orthocas that needs a library is imported before the libraries are known to be there.
+# Modules of orthocas that need a library are imported only after that library is found.
 
 EXTRAS = {
     "robots": "robots by name, such as panda",
@@ -31,32 +31,34 @@ EXTRAS = {
     "recordings": "joints in MCAP files of rosbag2",
     "learn": "environments of Gymnasium",
     "dask": "proofs and comparisons on many machines",
-}  #: what is lost without each of the extras
+}  #: extra -> what needs it
 PROGRAMS = {
     "cmake": "building generated C in projects",
     "ffmpeg": "animations as MP4",
-}  #: what is lost without each program
-#: modules of distributions that have other names
+}  #: program -> what needs it
+#: module names that differ from the name of the distribution
 _MODULES = {"pin": "pinocchio", "scikit-image": "skimage", "pillow": "PIL", "libigl": "igl"}
 _REQUIREMENT = re.compile(r"""([\w.-]+)(?:\[[^]]*\])?(?:>=([\w.]+))?[^;]*(?:;.*extra == ["']([\w-]+)["'].*)?""")
-_FAULTY = 1  # exit code
-_WIDTH = 80  # of lines
+# Exit code.
+_FAULTY = 1
+# Width of lines.
+_WIDTH = 80
 
 
 @dataclass(frozen=True, slots=True)
 class Part:
-    """A distribution that orthocas asks for, and what is there."""
+    """A distribution that orthocas uses, and its state."""
 
     name: str
-    extra: str  #: the extra that asks for it; empty for the core
+    extra: str  #: the extra that requires it; empty for the core
     version: str  #: empty if it is missing
-    fault: str  #: why it cannot be used; empty if it can
+    fault: str  #: why it cannot be used; empty if it can be used
 
 
 def doctor(
     json: Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")] = False,
 ) -> None:
-    """Show what is installed, what is missing for what, and whether a first chart works. Exit code 1 if not."""
+    """Show installed and missing packages and their uses, and test a first chart. Exit code 1 on failure."""
     parts = list(find_parts())
     core = {part.name: part.version for part in parts if not part.extra}
     faults = [part.fault for part in parts if part.fault and not part.extra]
@@ -82,7 +84,7 @@ def doctor(
 
 
 def find_parts() -> Iterator[Part]:
-    """What orthocas asks for by its metadata, with what is there; nothing if it is only on the path."""
+    """The distributions that the metadata of orthocas requires; nothing if orthocas is only on the path."""
     try:
         requirements = metadata.requires("orthocas") or []
     except metadata.PackageNotFoundError:
@@ -98,12 +100,12 @@ def find_parts() -> Iterator[Part]:
 
 
 def _find_version(name: str, load: bool) -> tuple[str, str]:
-    """The version of a distribution, empty if it is missing, and why it cannot be used."""
+    """Version of a distribution (empty if missing), and why it cannot be used (empty if it can)."""
     module = _MODULES.get(name, name.replace("-", "_"))
     try:
         version = metadata.version(name)
     except metadata.PackageNotFoundError:
-        # Conda's pinocchio and igl have no metadata of the names that they have on PyPI.
+        # Conda's pinocchio and igl have no metadata under their PyPI names.
         if find_spec(module) is None:
             return "", f"{name} is missing: pip install {name}"
         version = str(getattr(import_module(module), "__version__", "of unknown version"))
@@ -111,20 +113,20 @@ def _find_version(name: str, load: bool) -> tuple[str, str]:
         try:
             import_module(module)
         except Exception as error:
-            # Whatever stops it, such as a shared library that is not found: the user needs its words.
+            # Report any error, such as a missing shared library, in its own words.
             return version, f"{name} {version} cannot be imported: {type(error).__name__}: {error}"
     return version, ""
 
 
 def _leading_numbers(version: str) -> list[int]:
-    """Up to three numbers of a version; one without numbers counts as new enough."""
+    """Up to three numbers of a version; a version without numbers counts as new enough."""
     return [int(digits) for digits in re.findall(r"\d+", version.partition("+")[0])[:3]] or [sys.maxsize]
 
 
 def find_compiler_versions() -> list[str]:
-    """What the C compilers on the PATH say of themselves."""
+    """First lines of --version of the C compilers on the PATH."""
     found = [path for name in ("gcc", "clang") if (path := shutil.which(name)) is not None]
-    # Other systems call their compiler cc.
+    # On other systems the compiler is called cc.
     found = found or [path for path in (shutil.which("cc"),) if path is not None]
     said = [subprocess.run([path, "--version"], capture_output=True, text=True, check=False).stdout for path in found]
     return [text.splitlines()[0].strip() for text in said if text]
@@ -132,15 +134,17 @@ def find_compiler_versions() -> list[str]:
 
 def find_linear_algebra() -> list[str]:
     """The libraries of BLAS and OpenMP in this process, with their threads."""
-    from threadpoolctl import threadpool_info  # after it is known to be there
+    # Imported only after it is found.
+    from threadpoolctl import threadpool_info
 
     found = {(each["internal_api"], each["version"] or "", each["num_threads"]) for each in threadpool_info()}
     return [f"{f'{name} {version}'.strip()}, {threads} threads" for name, version, threads in sorted(found)]
 
 
 def run_checks(compiler: bool) -> Iterator[tuple[str, str]]:
-    """Fit and invert a chart of a planar arm, and compare its C with Python: what was done, or what failed."""
-    import numpy as np  # this and the others after they are known to be there
+    """Fit and invert a chart of a planar arm, and compare its C with Python; yields results or errors."""
+    # These modules are imported only after they are found.
+    import numpy as np
 
     from orthocas import problems
     from orthocas.bases.products import Linear
@@ -164,7 +168,7 @@ def run_checks(compiler: bool) -> Iterator[tuple[str, str]]:
 
 
 def _format_lines(data: dict[str, Any]) -> Iterator[str]:
-    """The report for people: a name and a text on each line, long texts on several."""
+    """The report as text: a name and a value per line, with long values on several lines."""
     rows = [
         ("orthocas", f"{data['orthocas']} in {data['folder']}"),
         ("python", f"{data['python']}, {data['platform']}"),

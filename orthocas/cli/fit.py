@@ -58,7 +58,8 @@ from orthocas.tools.interrupts import INTERRUPTED
 from orthocas.tools.json import clean, collect_attributes
 from orthocas.tools.progress import Monitor
 
-_WIDE_ROWS = ("regular", "left out", "least leak", "meaning")  # facts of wide fits
+# facts of wide fits to print
+_WIDE_ROWS = ("regular", "left out", "least leak", "meaning")
 
 
 @spread("words", ProblemOptions, *CHAIN, *DOMAIN)
@@ -77,7 +78,7 @@ def fit(
     if options.domain == ALL:
         _fit_arm(problem, words, options, out, force, json)
         return
-    # What can be refused is refused before anything takes time.
+    # Check arguments before anything takes time.
     kind, branch = options.parse_domain()
     built = None if kind else _build_problem(problem, words, options.corridor)
     target = out or Path(f"{Path(problem).stem if built is None else built.name}.orthocas")
@@ -92,7 +93,7 @@ def fit(
         with terminal_monitor() as monitor:
             if kind == AUTO:
                 built, suggestion = _suggest_problem(problem, words, options, parametrisation, loss, monitor)
-                # The fit that confirmed the domain serves if it has the family that is asked for.
+                # Reuse the fit that confirmed the domain if it has the requested family.
                 default = choose_parametrisation(built, True) == choose_parametrisation(built, False)
                 same = parametrisation is not None or default
                 if same and (solver, options.samples, like) == (None,) * 3:
@@ -118,14 +119,15 @@ def fit(
 
 def _fit_arm(name: str, words: ProblemOptions, options: FitOptions, out: Path | None, force: bool, json: bool) -> None:
     """Fit a chart to every branch, and write and print the arm."""
-    from orthocas.arms.arm import Arm  # with all that arms need, which other fits do not
+    # Imports all modules for arms, which other fits do not need.
+    from orthocas.arms.arm import Arm
     from orthocas.arms.arm_file import ARM
 
     plain = FitOptions(domain=options.domain, seed=options.seed)
     if given := [part.name for part in fields(plain) if getattr(plain, part.name) != getattr(options, part.name)]:
-        raise OptionError(f"--domain all chooses by itself: leave out --{given[0].replace('_', '-')}")
+        raise OptionError(f"--domain all chooses this itself: leave out --{given[0].replace('_', '-')}")
     words.require_none(("centre", "half_width", "home", "least_singular_value"), "--domain all is all there is")
-    # What can be refused is refused before anything takes time.
+    # Check arguments before anything takes time.
     target = out or Path(f"{Path(name).stem}.arm")
     require_free(target, ARM, force)
     base = None if is_robot_file(name) else words.build_problem(name)
@@ -145,13 +147,13 @@ def _fit_arm(name: str, words: ProblemOptions, options: FitOptions, out: Path | 
 
 
 def _build_problem(name: str, words: ProblemOptions, corridor: Path | None) -> Problem:
-    """The problem of a command line, in the surroundings of the postures of a file if one is given."""
+    """The problem of a command line, on a corridor around the postures of a file if one is given."""
     if corridor is None:
         return words.build_problem(name)
-    words.require_none(("centre", "home", "least_singular_value"), "--corridor is a domain")
+    words.require_none(("centre", "home", "least_singular_value"), "--corridor defines the domain")
     radius = words.parse_half_width()
     if radius is not None and not isinstance(radius, float):
-        raise InvalidValueError("--half-width", words.half_width, "one number: the radius of the corridor")
+        raise InvalidValueError("--half-width", words.half_width, "one number, which is the radius of the corridor")
     problem = replace(words, half_width=None).build_problem(name)
     return corridor_problem(problem, read_postures(corridor, problem.robot), RADIUS if radius is None else radius)
 
@@ -164,10 +166,10 @@ def _suggest_problem(
     weights: Weights,
     monitor: Monitor,
 ) -> tuple[Problem, DomainSuggestion]:
-    """The problem of `--domain auto`, and the suggestion that its domain comes from."""
+    """The problem of `--domain auto`, and the domain suggestion that it comes from."""
     words.require_none(("half_width",), "--domain auto finds the half-width")
     words.require_none(("least_singular_value",), "--domain auto stays clear of singular postures")
-    # A named problem, or what the options describe for a robot file.
+    # Take a named problem, or the problem that the options describe for a robot file.
     base = None if is_robot_file(name) else words.build_problem(name)
     robot, task, metric = _build_parts(name, words, base)
     home = words.home or (words.find_centre(robot) if base is None else base.domain.home)
@@ -195,16 +197,16 @@ def _fit_wide(
     weights: Weights | Mapping[str, float] | None,
     monitor: Monitor,
 ) -> WideFit:
-    """Fit the wide chart of `--domain branch`; the home chooses the branch if it has no name."""
-    words.require_none(("centre", "half_width"), "--domain branch is a domain")
+    """Fit the wide chart of `--domain branch`; without a name, the branch is that of the home."""
+    words.require_none(("centre", "half_width"), "--domain branch defines the domain")
     base = None if is_robot_file(name) else replace(words, least_singular_value=None).build_problem(name)
     robot, task, metric = _build_parts(name, words, base)
     solid = options.add_to(robot)
-    # The task is one of the same joints.
+    # Rebuild the task on the robot with solids.
     task = task if solid is robot else Task.from_recipe(solid, task.recipe)
     centre = None if base is None or branch else base.domain.home
     with warnings.catch_warnings():
-        # commands print a note instead
+        # Commands print a note instead.
         warnings.simplefilter("ignore", BranchWarning)
         return fit_wide(
             solid,
@@ -225,7 +227,7 @@ def _fit_wide(
 
 
 def _build_parts(name: str, words: ProblemOptions, base: Problem | None) -> tuple[Robot, Task, Metric | str]:
-    """Robot, task and metric of a named problem, or those that the options describe for a robot file."""
+    """Robot, task and metric of a named problem, or those described by the options for a robot file."""
     if base is not None:
         return base.robot, base.task, base.metric
     robot = words.build_robot(name)
@@ -235,7 +237,7 @@ def _build_parts(name: str, words: ProblemOptions, base: Problem | None) -> tupl
 def _save_and_report(
     result: Fit, suggestion: DomainSuggestion | None, target: Path, seed: int, force: bool, json: bool
 ) -> None:
-    """Write the chart, print what it is like, and end with the exit code of Ctrl-C if that ended the fit."""
+    """Save the chart, print its quality, and exit with the code of Ctrl-C if that ended the fit."""
     if isinstance(result, WideFit) and result.left_out:
         note(f"the chart of branch '{result.chart.notes['branch']}' leaves out {result.left_out}")
     fitted = result.chart.problem
@@ -248,7 +250,7 @@ def _save_and_report(
     else:
         rows = _format_fit(result, report, target)
         if suggestion is not None:
-            # What ends the domain in each joint.
+            # Show what limits the domain in each joint.
             rows["home"] = f"{number_list(suggestion.home)} ({suggestion.home_source})"
             rows |= {end.joint: f"half-width {end.half_width:.3g}, {end.explanation}" for end in suggestion.joints}
         print_rows(rows, f"orthocas view {target}")
@@ -258,13 +260,13 @@ def _save_and_report(
 
 
 def _format_fit(result: Fit, report: Report, target: Path) -> dict[str, str]:
-    """What a fit prints."""
+    """The rows that a fit prints."""
     coordinates, robot = result.chart.coordinates, result.chart.problem.robot
     rows = format_report_rows(report, result.chart)
     rows["robot"] = f"{robot.n} joints, {'tip' if len(robot.tips) == 1 else 'tips'} {listed(robot.tips)}"
     if not isinstance(result, WideFit):
         rows |= result.chart.problem.domain.describe_condition()
-    # Adam follows a schedule, so its end is no failure
+    # Adam follows a schedule, so reaching its last step is no failure.
     planned = result.status is Status.ITERATION_LIMIT and result.chart.notes.get("solver") == "adam"
     ended = "all steps made" if planned else result.status.value
     rows["fit"] = f"{coordinates.label}, {result.seconds:.2f} s, {ended}"

@@ -59,22 +59,22 @@ def follow(
     # CasADi may lose Ctrl-C while it builds functions.
     with deferred():
         loaded = load(chart)
-        # Raises for grown charts.
+        # Refuse grown charts.
         loaded.function("xi")
-    # What is to be followed, and what the arm may hit: its links, or rods in their place, and obstacles.
+    # Read the path, and the solids to avoid: links (or rods in their place) and obstacles.
     waypoints, choice = _read_task(path, loaded, xi)
     model = solids.build_model(loaded.problem.robot)
     if link_radius is not None and (model is not None or not obstacle):
-        raise OptionError("--link-radius requires --obstacle, and no --collisions, which has the true links")
+        raise OptionError("--link-radius requires --obstacle, and excludes --collisions, which has the true links")
     if obstacle:
         scene = Scene({f"obstacle {k}": _build_obstacle(text) for k, text in enumerate(obstacle)})
         if link_radius is None and model is None and loaded.problem.robot.solids is None:
             raise OptionError(
-                "--obstacle requires --collisions FILE.urdf, or --link-radius: the links' solids are unknown"
+                "--obstacle requires --collisions FILE.urdf, or --link-radius: without them, the links have no solids"
             )
         robot = loaded.problem.robot if link_radius is None else loaded.problem.robot.with_rods(link_radius)
         model = (robot.collisions if model is None else model).with_scene(scene)
-    # The motion on time stamps, within limits of velocity and acceleration.
+    # Compute the motion on time stamps, within limits of velocity and acceleration.
     begin = time.perf_counter()
     motion = follow_path(
         loaded,
@@ -97,8 +97,8 @@ def follow(
 
 
 def _read_task(path: Path, chart: Chart, xi: str | None) -> tuple[Array, Any]:
-    """The waypoints, and what to do with the coordinates: as asked for, or as the columns of the file suggest."""
-    # Columns of xi in the file are a schedule, which no other choice may contradict.
+    """The waypoints, and the treatment of the coordinates: as requested, or according to the columns of the file."""
+    # Columns of xi in the file are a schedule, which excludes any other choice.
     waypoints, schedule = read_path(path, chart)
     choice = xi or (HOLD if schedule is None else SCHEDULE)
     require_known("choice of --xi", choice, _CHOICES)
@@ -110,7 +110,7 @@ def _read_task(path: Path, chart: Chart, xi: str | None) -> tuple[Array, Any]:
 
 
 def _build_obstacle(text: str) -> Solid:
-    """Read sphere:X,Y,Z,RADIUS and the like."""
+    """Read an obstacle such as sphere:X,Y,Z,RADIUS."""
     kind, _, numbers = text.partition(":")
     counts = {"sphere": 4, "capsule": 7, "plane": 6}
     require_known("kind of --obstacle", kind, counts)

@@ -1,4 +1,4 @@
-"""`orthocas info`: what a chart, a named problem or a robot file holds."""
+"""`orthocas info`: contents of a chart, a named problem or a robot file."""
 
 from collections.abc import Callable
 from pathlib import Path
@@ -44,7 +44,7 @@ def info(
     json: AsJson = False,
 ) -> None:
     """Show a chart, a named problem, or a robot."""
-    # A robot has joints and what is redundant for usual tasks; problems and charts have a task and a domain.
+    # A robot has joints, and redundancy for usual tasks; problems and charts have a task and a domain.
     if is_robot_file(target):
         robot = words.build_robot(target)
         data = {
@@ -78,12 +78,12 @@ def info(
         print_json(data)
     else:
         then = f"orthocas {'view' if 'parametrisation' in data else 'fit'} {target}"
-        # Branches are a table of their own.
+        # Print branches in a table of their own.
         tables = ("branches", "clearance_at_most", "postures") if branches else ()
         rows = {name: _format(value, name) for name, value in data.items() if name not in tables}
         print_rows(rows, "" if branches else then)
         if branches:
-            # Name, share, the clearance that a wide chart needs if it is lower, and a posture.
+            # Columns: name, share, the clearance of wide charts where it is lower, and a posture.
             lower = data.get("clearance_at_most", {})
             table = [("branch", "share", *(("clearance at most",) if lower else ()), "a posture")]
             for name, share in data["branches"].items():
@@ -94,8 +94,9 @@ def info(
 
 
 def _load_chart(target: str) -> "Chart":
-    """The chart of a file or a ready one; a target that looks like a name, and is none, raises the known ones."""
-    from orthocas.charts.ready import load, names  # takes long to import, and problems and robots do not need it
+    """Load a chart file or a ready chart. If a target looks like an unknown name, the error lists the known names."""
+    # Takes long to import; problems and robots do not need it.
+    from orthocas.charts.ready import load, names
 
     if target not in names() and not Path(target).exists() and not Path(target).suffix:
         ProblemOptions().build_problem(target)
@@ -120,9 +121,9 @@ def _describe_robot(robot: Robot) -> dict[str, Any]:
 
 
 def _describe_redundancy(robot: Robot) -> dict[str, Any]:
-    """The number r = n - m of extra coordinates of each task that has some, and the joints that do not move it."""
+    """The number r = n - m of extra coordinates for each redundant usual task, and the joints that do not move it."""
     kinds = ("position", "pose", *(("relative_position", "relative_pose") if len(robot.tips) == 2 else ()))
-    # No posture in which joints happen to be parallel.
+    # A generic posture, in which no axes happen to be parallel.
     q = robot.tree.centre_posture + 0.1 * np.arange(1, robot.n + 1)
     coordinates, floating = {}, robot.tree.floating
     for kind in kinds:
@@ -139,9 +140,9 @@ def _describe_redundancy(robot: Robot) -> dict[str, Any]:
 
 
 def _describe_branches(robot: Robot, task: Task | None) -> dict[str, Any]:
-    """The branches of the joint range: what cuts it, and for each its share of the clear positions and a posture.
+    """The branches of the joint range: their cuts, and the share of clear positions and a posture of each branch.
 
-    Branches that are too near to singular positions for the default clearance of wide charts have the one they allow.
+    A branch too singular for the default clearance of wide charts lists the largest clearance that it allows.
     """
     branching = find_branches(robot, task)
     lower = {item.name: item.clearance for item in branching if item.clearance < BRANCH_RULES.nonsingular}
@@ -154,8 +155,9 @@ def _describe_branches(robot: Robot, task: Task | None) -> dict[str, Any]:
 
 
 def _describe_collisions(collisions: Collisions | None, draw: Callable[[int, int], Array]) -> dict[str, Any]:
-    """Pairs, what is unchecked, and how many of the postures touch that `draw` makes of a number and a seed."""
-    from orthocas.charts.quality import RULES, ContactShare  # as `_load_chart`
+    """Pairs, unchecked links, and the fraction of touching postures, which `draw(count, seed)` samples."""
+    # Slow to import, as in `_load_chart`.
+    from orthocas.charts.quality import RULES, ContactShare
 
     if collisions is None:
         return {}

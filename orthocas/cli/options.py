@@ -1,4 +1,4 @@
-"""The options of all commands in one table, and what commands build from them: numbers, robots, problems, weights."""
+"""Options shared by commands, and the objects built from them: numbers, robots, problems and weights."""
 
 import inspect
 from collections.abc import Callable, Mapping
@@ -45,7 +45,7 @@ def parse_number(text: str) -> float:
 Number = partial(typer.Option, parser=parse_number)
 Whole = partial(typer.Option, parser=parse_whole_number)
 
-# Options of several commands. An option of one command stands in its signature.
+# Options of several commands; an option of one command is in its signature.
 
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on standard output.")]
 Force = Annotated[bool, typer.Option("--force", help="Replace files of the same names that orthocas did not write.")]
@@ -56,7 +56,7 @@ SampleCount = Annotated[
 ]
 _LIMIT = 'Largest torque or speed, "50" or "50,40,..." per joint; default: the limits of the robot.'
 Limit = Annotated[str | None, typer.Option("--limit", help=_LIMIT)]
-# Options that describe a robot and a problem. Commands say which of them they take.
+# Options that describe a robot and a problem. Each command selects the ones it takes.
 
 ROBOT = ("tip", "lock", "tool", "base", "gravity", "payload")
 CHAIN = (*ROBOT, "task", "metric")
@@ -76,7 +76,7 @@ _LEAST = "Leave positions out of the domain where the task's relative singular v
 _SOLIDS = "Check collisions with the solids of this URDF file of the robot, or of a known robot such as panda."
 _SRDF = "SRDF file whose disabled pairs are not checked; default: that of the URDF file."
 
-# Options of earlier versions, and what says the same now. Commands refuse them with these words.
+# Options of earlier versions, and their replacements. Commands refuse them with these texts.
 
 FORMER = {
     "--branch": "fit names the branch by --domain branch:NAME; Python asks for one: arm.solve(x, xi, branch=NAME)",
@@ -125,20 +125,20 @@ class ProblemOptions:
     least_singular_value: Annotated[float | None, Number("--least-singular-value", help=_LEAST)] = None
 
     def require_none(self, names: tuple[str, ...], reason: str) -> None:
-        """Raise OptionError with the reason if one of these options was given."""
+        """Raise OptionError with a reason if one of these options was given."""
         for name in names:
             if getattr(self, name) not in (None, []):
                 raise OptionError(f"{reason}: leave out --{name.replace('_', '-')}")
 
     def require_no_robot(self, owner: str) -> None:
-        """Raise OptionError if an option describes a robot, because `owner` has its own."""
+        """Raise OptionError if an option describes a robot, because `owner` already has one."""
         self.require_none(ROBOT, f"{owner} has its own robot")
 
     def build_robot(self, path: str) -> Robot:
-        """Build the joints of a robot file. Those that move no tip are locked.
+        """Build the robot of a file. Joints that move no tip are locked.
 
         Raises:
-            OrthocasError: if anything does not fit together.
+            OrthocasError: if the file or an option is invalid.
         """
         tool = None if self.tool is None else parse_numbers("--tool", self.tool)
         gravity = None if self.gravity is None else parse_numbers("--gravity", self.gravity)
@@ -151,13 +151,14 @@ class ProblemOptions:
         return robot.with_payload(carried[0] if len(carried) == 1 else carried)
 
     def build_problem(self, name: str) -> Problem:
-        """Build the problem of a name, or of a robot file.
+        """Build a named problem, or the problem of a robot file.
 
         Raises:
             UnknownNameError: if `name` is neither a named problem nor a robot file.
-            OrthocasError: if anything does not fit together.
+            OrthocasError: if the options are invalid or do not fit together.
         """
-        from orthocas import problems  # builds arms, which commands on charts do not need
+        # This builds arms, which commands on charts do not need.
+        from orthocas import problems
 
         if is_robot_file(name):
             robot = self.build_robot(name)
@@ -169,7 +170,7 @@ class ProblemOptions:
             return Problem(robot, task, self.metric or "euclidean", box, Path(name).stem, self.least_singular_value)
         if name not in problems.names():
             raise UnknownNameError("problem or robot", name, (*problems.names(), *list_robot_files(), "or a FILE.urdf"))
-        # A named problem, with what the options change.
+        # Start from a named problem, and apply the options.
         base: Problem = problems.get(name)
         if all(value in (None, []) for value in astuple(self)):
             return base
@@ -192,7 +193,7 @@ class ProblemOptions:
         return locked
 
     def find_centre(self, robot: Robot) -> Array | None:
-        """The centre that --centre or --home gives; None without either."""
+        """The centre from --centre or --home; None without either option."""
         if self.home is None:
             return None if self.centre is None else parse_numbers("--centre", self.centre)
         if self.centre is not None:
@@ -206,21 +207,21 @@ class ProblemOptions:
 
 @dataclass(frozen=True)
 class SolidOptions:
-    """The command-line options that name the solids of a robot, and the pairs that are not checked."""
+    """Options for the solids of a robot and for the pairs that are not checked."""
 
     collisions: Annotated[str | None, typer.Option("--collisions", metavar="FILE.urdf|NAME", help=_SOLIDS)] = None
     srdf: Annotated[Path | None, typer.Option("--srdf", help=_SRDF)] = None
 
     def add_to(self, robot: Robot) -> Robot:
-        """The robot with these solids; the robot itself without the options.
+        """The robot with these solids, or the same robot without these options.
 
         Raises:
             OptionError: for --srdf alone.
-            RobotError: if a file cannot be read, or is that of another robot.
+            RobotError: if a file cannot be read, or belongs to another robot.
         """
         if self.collisions is None:
             if self.srdf is not None:
-                raise OptionError("--srdf requires --collisions FILE.urdf, which has the solids")
+                raise OptionError("--srdf requires --collisions FILE.urdf with the solids")
             return robot
         path = find_robot_file(self.collisions) if is_robot_name(self.collisions) else Path(self.collisions)
         solid = robot.with_solids(path, self.srdf)
@@ -229,26 +230,27 @@ class SolidOptions:
         return solid
 
     def build_model(self, robot: Robot) -> Collisions | None:
-        """The collision model that the options name; None without them. Errors as in `add_to`."""
+        """The collision model from the options; None without them. Raises errors as in `add_to`."""
         solid = self.add_to(robot)
         return None if solid is robot else solid.collisions
 
 
 def is_robot_file(name: str) -> bool:
-    """Whether a PROBLEM argument means a robot: a file of one, or a name of an installed package."""
+    """Whether a PROBLEM argument is a robot: a robot file, or a name that an installed package knows."""
     return Path(name).suffix.lower() in (".urdf", ".xml", ".xacro") or is_robot_name(name)
 
 
 def is_robot_name(name: str) -> bool:
-    """Whether a PROBLEM argument is no file and no problem, but a robot that `Robot.from_name` knows."""
-    from orthocas import problems  # builds arms, which commands on files do not need
+    """Whether a PROBLEM argument is neither a file nor a problem, but a robot that `Robot.from_name` knows."""
+    # This builds arms, which commands on files do not need.
+    from orthocas import problems
 
     plain = Path(name).name == name and not Path(name).suffix and name not in problems.names()
     return plain and name in list_robot_files() and not Path(name).exists()
 
 
 def spread(parameter: str, kind: type, *names: str) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """A decorator of commands: fields of a dataclass of options, by default all, take the place of one parameter."""
+    """A decorator of commands: replaces one parameter by options, one for each (named) field of a dataclass."""
     hints = get_type_hints(kind, include_extras=True)
     options = {
         field.name: (hints[field.name], field.default) for field in fields(kind) if not names or field.name in names
@@ -259,12 +261,12 @@ def spread(parameter: str, kind: type, *names: str) -> Callable[[Callable[..., N
 def spread_options(
     parameter: str, options: Mapping[str, tuple[Any, Any]], build: Callable[[dict[str, Any]], Any]
 ) -> Callable[[Callable[..., None]], Callable[..., None]]:
-    """A decorator of commands: options take the place of one parameter.
+    """A decorator of commands: replaces one parameter by options.
 
     Args:
-        parameter: its name.
-        options: annotations and defaults of the options, by name.
-        build: makes the parameter of the values of the options.
+        parameter: name of the parameter.
+        options: name -> annotation and default of an option.
+        build: computes the parameter from the values of the options.
     """
 
     def decorate(command: Callable[..., None]) -> Callable[..., None]:
@@ -281,7 +283,7 @@ def spread_options(
             own = {name: values.pop(name) for name in options}
             command(**{parameter: build(own)}, **values)
 
-        # typer reads both
+        # typer reads both attributes.
         vars(call)["__signature__"] = inspect.Signature(parameters)
         call.__annotations__ = {part.name: part.annotation for part in parameters}
         return call
@@ -290,7 +292,7 @@ def spread_options(
 
 
 def parse_numbers(option: str, text: str, count: int | None = None) -> Array:
-    """Parse "0,0.5,...", with so many numbers if a count is given."""
+    """Parse "0,0.5,...", with `count` numbers if it is given."""
     words = [part.strip() for part in text.split(",")]
     try:
         numbers = np.array([float(word) for word in words])
@@ -312,7 +314,7 @@ WEIGHTS_TEXT = ",".join(f"{getattr(DEFAULT_WEIGHTS, name):g}" for name in _WEIGH
 
 
 def parse_weights(text: str, angles: str | None) -> Weights:
-    """Read two to five numbers and terms by name, such as "1000,30,quiet=5", with the kind of angles."""
+    """Parse two to five numbers, then terms by name, such as "1000,30,quiet=5", with the kind of angles."""
     words = [word.strip() for word in text.split(",")]
     numbers = [float(value) for word in words if "=" not in word for value in parse_numbers("--weights", word)]
     if not (2 <= len(numbers) <= 5 or (not numbers and text)):
@@ -323,8 +325,9 @@ def parse_weights(text: str, angles: str | None) -> Weights:
     return replace(Weights.of(numbers) if numbers else Weights(), extra=extra, angles=cast(Angles | None, angles))
 
 
-AUTO, BRANCH, ALL = "auto", "branch", "all"  #: words of --domain
-_IN_CORRIDOR = "polynomial:3:cyclic"  # more terms gain little there
+AUTO, BRANCH, ALL = "auto", "branch", "all"  #: keywords of --domain
+# Further terms gain little in a corridor.
+_IN_CORRIDOR = "polynomial:3:cyclic"
 _PARAM = (
     "Parametrisation: polynomial:5, polynomial:5:cyclic, polynomial:4:joints=2, fourier:2, mlp:64x64, mlp:64x64:raw, "
     "linear or sew; default: polynomial:5, or polynomial:4 for more than seven joints; polynomial:3:cyclic with "
@@ -357,7 +360,7 @@ _AVOID = "With --domain branch: be regular where the robot does not hit itself, 
 
 @dataclass(frozen=True)
 class FitOptions(SolidOptions):
-    """The options of a fit, beside those that describe its problem."""
+    """Options of a fit, in addition to those of its problem."""
 
     param: Annotated[str | None, typer.Option("--param", help=_PARAM)] = None
     solver: Annotated[str | None, typer.Option("--solver", help=_SOLVER)] = None
@@ -375,19 +378,19 @@ class FitOptions(SolidOptions):
 
     @property
     def parametrisation(self) -> Parametrisation | None:
-        """That of --param, or of a corridor."""
+        """The parametrisation of --param, or the default of a corridor."""
         param = _IN_CORRIDOR if self.param is None and self.corridor is not None else self.param
         return None if param is None else parse_parametrisation(param)
 
     @property
     def quantities(self) -> str | list[str] | None:
-        """The name, or several, of --like."""
+        """The name or the names of --like."""
         names = [word.strip() for word in (self.like or "").split(",")]
         return None if self.like is None else names[0] if len(names) == 1 else names
 
     @property
     def wide_weights(self) -> Weights | Mapping[str, float] | None:
-        """Weights of a wide fit: numbers take the place of its own weights, terms by name alone join these."""
+        """Weights of a wide fit. Numbers replace its own weights; terms by name alone are added to them."""
         numbers = self.weights != WEIGHTS_TEXT and any("=" not in word for word in self.weights.split(","))
         if self.angles is not None and not numbers:
             raise OptionError(
@@ -399,10 +402,10 @@ class FitOptions(SolidOptions):
         return weights if numbers else weights.extra
 
     def parse_domain(self) -> tuple[str, str]:
-        """The kind of a domain, and the name of its branch; raises OptionError for options of another kind."""
+        """The kind of a domain and the name of its branch; raises OptionError for options of another kind of domain."""
         kind, _, branch = (self.domain or "").partition(":")
         if self.domain is not None and self.corridor is not None:
-            raise OptionError("--corridor is a domain: leave out --domain")
+            raise OptionError("--corridor defines the domain: leave out --domain")
         if kind != AUTO:
             for option, value in (("leak-deg", self.leak_deg), ("conditioning", self.conditioning)):
                 if value is not None:
@@ -415,5 +418,5 @@ class FitOptions(SolidOptions):
         if self.exact and (kind != BRANCH or self.like is None):
             raise OptionError("--exact requires --domain branch and --like")
         if kind == BRANCH and self.solver is not None:
-            raise OptionError("--domain branch has a solver of its own: leave out --solver")
+            raise OptionError("--domain branch uses its own solver: leave out --solver")
         return kind, branch.strip()

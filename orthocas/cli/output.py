@@ -1,4 +1,4 @@
-"""What commands print: aligned text for people or one JSON object, remarks, and progress on standard error."""
+"""Output of commands: aligned text or a JSON object, remarks, and progress on standard error."""
 
 import sys
 import threading
@@ -20,8 +20,9 @@ if TYPE_CHECKING:
     from orthocas.charts.quality import Report
     from orthocas.charts.self_motion import XiRange
 
-PAUSE = 10.0  #: [s] between lines of progress where there is no terminal
-_UNEVEN = 30.0  # ratio of gradient lengths above which the same gain means too different things across the domain
+PAUSE = 10.0  #: [s] between lines of progress if there is no terminal
+# Ratio of gradient lengths above which one gain has too different effects across the domain.
+_UNEVEN = 30.0
 
 
 def print_json(data: Mapping[str, Any]) -> None:
@@ -30,8 +31,8 @@ def print_json(data: Mapping[str, Any]) -> None:
 
 
 def print_rows(rows: dict[str, str], then: str = "") -> None:
-    """Print names and values in two columns; to people also what to do next, a command."""
-    # People get a table as wide as their terminal; files and pipes one line a row, which programs can read.
+    """Print names and values in two columns; on a terminal also a command to try next."""
+    # A terminal gets a table of its width. Files and pipes get one row per line, for programs.
     if sys.stdout.isatty():
         _draw(list((rows | {"next": then} if then else rows).items()))
         return
@@ -41,14 +42,14 @@ def print_rows(rows: dict[str, str], then: str = "") -> None:
 
 
 def print_table(rows: Sequence[Sequence[str]], then: str = "") -> None:
-    """Print rows in aligned columns, the first one as their head; the last cell of a short row may be long."""
+    """Print rows in aligned columns; the first row is the head. The last cell of a short row may be long."""
     head = rows[0]
     if sys.stdout.isatty():
         _draw(rows[1:], head)
         if then:
             print_rows({"next": then})
         return
-    # A long last cell, such as an explanation, does not widen its column for all rows.
+    # A long last cell, such as an explanation, must not widen its column for all rows.
     aligned = [row if len(row) == len(head) else row[:-1] for row in rows]
     widths = [max(len(row[k]) for row in aligned if k < len(row)) for k in range(len(head))]
     for row in rows:
@@ -57,15 +58,16 @@ def print_table(rows: Sequence[Sequence[str]], then: str = "") -> None:
 
 
 def _draw(rows: Sequence[Sequence[str]], head: Sequence[str] = ()) -> None:
-    """Print rows to a terminal: as wide as it is, and broken between words."""
-    from rich.console import Console  # only terminals need it
+    """Print rows to a terminal at its width, broken between words."""
+    # Only terminals need this import.
+    from rich.console import Console
     from rich.table import Table
     from rich.text import Text
 
     table = Table(box=None, pad_edge=False, padding=(0, 2, 0, 0), show_header=bool(head), header_style="bold")
     for k in range(max(map(len, rows))):
         title = head[k] if head else ""
-        # Rich folds words where a column is narrower than they are: a column is as wide as its longest word.
+        # rich breaks words in narrow columns, so make each column as wide as its longest word.
         words = [word for row in rows for word in row[k].split()] if k else []
         longest = min(max(map(len, (*title.split(), *words)), default=0), 20)
         table.add_column(title, no_wrap=k == 0, overflow="fold", style="cyan" if k == 0 else "", min_width=longest)
@@ -80,8 +82,8 @@ def note(text: str) -> None:
 
 
 def format_report_rows(report: "Report", chart: "Chart") -> dict[str, str]:
-    """The rows of a quality report, with what is normal for a wide chart, or advice on options for a tight one."""
-    # The standards of tight charts say nothing of wide ones, whose leaks are large by nature.
+    """The rows of a quality report, with the usual values of wide charts, or with advice for tight ones."""
+    # The limits for tight charts do not apply to wide ones, whose leaks are naturally large.
     rows = report.facts()
     if "branch" in chart.notes:
         rows["wide"] = (
@@ -97,7 +99,7 @@ def format_report_rows(report: "Report", chart: "Chart") -> dict[str, str]:
 
 
 def format_reach_rows(chart: "Chart") -> dict[str, str]:
-    """The ranges of xi in one row, and how far the joints move for a unit of it at the home: |dq/dxi|."""
+    """The ranges of xi in one row, and the joint motion per unit of xi at the home, |dq/dxi|."""
     if (reach := _find_reach(chart)) is None:
         return {}
     named = [name.partition(": ")[2] for name in chart.parts.named_coordinates]
@@ -105,7 +107,7 @@ def format_reach_rows(chart: "Chart") -> dict[str, str]:
         f"{part.label} {part.low:.3g} to {part.high:.3g}{f' ({name})' if name else ''}"
         for part, name in zip(reach, named, strict=True)
     ]
-    # Columns of the inverse Jacobian: what xi is worth, whatever metric scales it.
+    # Columns of the inverse Jacobian show the effect of xi, independent of the metric.
     moved = np.linalg.norm(np.linalg.inv(chart.jacobian(chart.problem.domain.home))[:, chart.m :], axis=0)
     unit = "rad or m" if any(chart.robot.tree.prismatic) else "rad"
     worth = ", ".join(f"{part.label} {length:.2g}" for part, length in zip(reach, moved, strict=True))
@@ -113,7 +115,7 @@ def format_reach_rows(chart: "Chart") -> dict[str, str]:
 
 
 def build_reach_data(chart: "Chart") -> dict[str, Any]:
-    """The ranges of xi and what stops them there, for JSON."""
+    """The ranges of xi and what limits them, for JSON."""
     if (reach := _find_reach(chart)) is None:
         return {}
     return {
@@ -124,7 +126,8 @@ def build_reach_data(chart: "Chart") -> dict[str, Any]:
 
 def _find_reach(chart: "Chart") -> "XiRange | None":
     """The ranges of xi at the centre; None for grown charts, which take seconds, and where the task is not finite."""
-    from orthocas.charts.coordinates import InvertibleMap  # only here: commands without charts print too
+    # Imported here, because commands without charts print too.
+    from orthocas.charts.coordinates import InvertibleMap
 
     if isinstance(chart.coordinates, InvertibleMap):
         return None
@@ -136,7 +139,7 @@ def _find_reach(chart: "Chart") -> "XiRange | None":
 
 @contextmanager
 def terminal_monitor() -> Iterator[Monitor]:
-    """A monitor that draws one bar per stage; a line every ten seconds when standard error is not a terminal."""
+    """A monitor that draws one bar per stage, or prints a line every ten seconds if there is no terminal."""
     bars = sys.stderr.isatty()
     with closing(TerminalBars(sys.stderr, transient=True)) if bars else lines_of_progress(PAUSE) as show:
         yield show
@@ -144,8 +147,8 @@ def terminal_monitor() -> Iterator[Monitor]:
 
 @contextmanager
 def lines_of_progress(pause: float) -> Iterator[Monitor]:
-    """A monitor whose last report is printed every `pause` seconds, also while one step takes longer than that."""
-    # A thread of its own speaks, because one step of a fit may take longer than the pause.
+    """A monitor that prints its last report every `pause` seconds, even during a step that takes longer."""
+    # A separate thread prints, because one step of a fit may take longer than the pause.
     begin, reports, ended = time.monotonic(), [""], threading.Event()
 
     def show(progress: Progress) -> None:

@@ -34,11 +34,12 @@ from orthocas.tools.interrupts import INTERRUPTED, deferred
 from orthocas.tools.json import clean, write_json
 
 _FILES = ("trajectory.npz", "coordinates.png", "report.json")
-CVODES = "cvodes"  #: the default plant
+CVODES = "cvodes"  #: name of the default plant
 _NOISE = (
     'Standard deviation of the sensors, "position,velocity" [rad], [rad/s], or "position,velocity,seed"; needs --rate.'
 )
-_FAILED = (Outcome.DIVERGED, Outcome.LOST)  # the input was valid, but the run failed: exit code 1
+# The run failed although the input was valid: exit code 1.
+_FAILED = (Outcome.DIVERGED, Outcome.LOST)
 
 
 @add_law_options(for_codegen=False)
@@ -76,14 +77,14 @@ def simulate(
     json: AsJson = False,
 ) -> None:
     """Run a controller in a chart's coordinates; write the run, pictures, an animation and a report."""
-    # What can be refused is refused before the chart is read.
+    # Check arguments before the chart is read.
     require_settings(controller, settings)
     _check_plant(controller, plant, rate, supervised, {"--mass-factor": mass_factor, "--friction": friction})
     _check_folder(out, animation, force)
     # CasADi may lose Ctrl-C while it builds functions.
     with deferred():
         loaded = load(chart)
-        # Raises for grown charts.
+        # Refuse grown charts.
         loaded.function("xi")
         plan = read_steps(steps, loaded)
         law = build_controller(controller, loaded, settings, limit)
@@ -96,7 +97,7 @@ def simulate(
         "noise": _build_noise(law, noise, rate),
         "safety": Safety.of(law) if supervised else None,
     }
-    # The run, its files and its pictures; Ctrl-C keeps what there is.
+    # Run, then write files and pictures. After Ctrl-C, the part so far is kept.
     begin = time.perf_counter()
     with terminal_monitor() as monitor:
         try:
@@ -110,7 +111,7 @@ def simulate(
             if animation != "none" and not interrupted:
                 save_animation(out / f"animation.{animation}", run, loaded.problem, monitor, force)
         except KeyboardInterrupt:
-            # The run is complete: keep it.
+            # The run is complete, so keep it.
             report = finish()
             interrupted = True
     # Numbers go to standard output, remarks to standard error.
@@ -127,11 +128,11 @@ def simulate(
 
 
 def _check_plant(controller: str, plant: str, rate: float | None, supervised: bool, of_torques: dict[str, Any]) -> None:
-    """Refuse options that do not fit the law, or require a rate of ticks."""
+    """Refuse options that do not fit the law, or that need a control rate."""
     for option, value in of_torques.items():
         if value is not None and law_of(controller).command != "torque":
             takers = ", ".join(name for name in CONTROLLERS if law_of(name).command == "torque")
-            raise OptionError(f"{controller} has no {option}, which belongs to {takers}")
+            raise OptionError(f"{controller} has no option {option}, which is for {takers}")
     require_known("plant", plant, (CVODES, MUJOCO))
     if plant == MUJOCO and rate is None:
         raise OptionError("--plant mujoco requires --rate: MuJoCo runs with a sampled controller")
@@ -140,7 +141,7 @@ def _check_plant(controller: str, plant: str, rate: float | None, supervised: bo
 
 
 def _check_folder(out: Path, animation: str, force: bool) -> None:
-    """Check, before anything is written, the format, and that the folder can be made or holds no files of others."""
+    """Check, before writing, the format, and that the folder can be created or holds no other files."""
     if animation != "none":
         require_format(animation)
     if out.exists() and not out.is_dir():
@@ -151,7 +152,7 @@ def _check_folder(out: Path, animation: str, force: bool) -> None:
 
 
 def _build_noise(law: Controller, text: str | None, rate: float | None) -> Noise | None:
-    """The noise of the sensors; raises InvalidValueError for a law that does not measure what is noisy."""
+    """The sensor noise; raises InvalidValueError for noise on a quantity that the law does not measure."""
     if text is None:
         return None
     if rate is None:
@@ -165,7 +166,7 @@ def _build_noise(law: Controller, text: str | None, rate: float | None) -> Noise
 def _finish(
     law: Controller, chart: Chart, plan: Plan, run: Trajectory, seconds: float, out: Path, force: bool
 ) -> dict[str, Any]:
-    """Write the run, its picture and its report, which is returned, and remove the animation of an earlier run."""
+    """Write the run, its picture and its report, and remove the animation of an earlier run; returns the report."""
     report = build_report(law, chart, plan, run, seconds)
     with open_output_folder("--out", out) as folder, publish(folder, listed=True, force=force) as drafts:
         run.save(drafts / "trajectory.npz")
@@ -179,7 +180,7 @@ def _finish(
 
 
 def _list_remarks(report: dict[str, Any], interrupted: bool) -> Iterator[str]:
-    """What went wrong in a run."""
+    """Remarks about problems in a run."""
     if (fallback := format_fallback(report)) is not None:
         yield fallback
     if report["outcome"] == Outcome.LOST.value:
@@ -191,8 +192,8 @@ def _list_remarks(report: dict[str, Any], interrupted: bool) -> Iterator[str]:
 
 
 def _find_contact(collisions: Collisions, run: Trajectory) -> str:
-    """The first contact of a run in a sentence, between its time stamps too; or how near it came to one."""
-    # Rows without numbers are those after a run diverged.
+    """A sentence about the first contact of a run, also between its time stamps, or about the least distance."""
+    # Rows after a run diverged are not finite.
     q = run.q[np.isfinite(run.q).all(axis=1)]
     contact = collisions.find_contact(q)
     if contact is not None:
@@ -213,17 +214,18 @@ _REASONS = {
     ControlStatus.BAD_INPUT: "a measurement or a reference could not be used",
     ControlStatus.TOO_FAST: "a joint exceeded its limit of velocity",
     ControlStatus.LATE: "a tick came too late",
-    ControlStatus.OK: "the arm was not well inside the domain",  # where a supervised law begins
+    # initial status of a supervised law
+    ControlStatus.OK: "the arm was not well inside the domain",
 }
 
 
 def build_report(controller: Controller, chart: Chart, plan: Plan, seen: Trajectory, seconds: float) -> dict[str, Any]:
-    """Numbers of a run, SI units, ready for JSON.
+    """Numbers of a run in SI units, ready for JSON.
 
     Args:
         controller: the controller that ran.
-        chart: the chart whose coordinates the run is measured in.
-        plan: the motion that it was to follow.
+        chart: the chart whose coordinates measure the run.
+        plan: the planned motion.
         seen: the run in the chart's coordinates.
         seconds: computing time [s].
     """
@@ -231,7 +233,7 @@ def build_report(controller: Controller, chart: Chart, plan: Plan, seen: Traject
     first = int(bad[0]) if bad.size else None
     status, cause = (ControlStatus(int(column[first or 0])) for column in (seen.status, seen.cause))
     inside = np.asarray(chart.problem.domain.contains(seen.q))
-    # Coupling is measured in runs of steps that nothing else disturbs.
+    # Coupling is measured in complete runs of steps without other disturbances.
     evaluated = (
         plan.has_steps and not plan.pushes and seen.outcome is Outcome.COMPLETE and inside.all() and not bad.size
     )
@@ -267,7 +269,7 @@ def build_report(controller: Controller, chart: Chart, plan: Plan, seen: Traject
             "storage_end": seen.storage[-1],
             "storage_largest": seen.storage.max(),
             "storage_rise": seen.storage_rise,
-            # by the controller's damping [J]
+            # Energy that the controller's damping dissipates [J].
             "dissipated": seen.energy_balance[-1] - seen.storage[-1] + seen.storage[0],
         }
     return dict(clean(report))
@@ -279,7 +281,7 @@ def format_report(report: dict[str, Any], problem: Problem) -> dict[str, str]:
     errors = [
         f"{label} {_format(value)} {units.get(label, '')}".strip() for label, value in report["tracking_error"].items()
     ]
-    # The unit of the largest command: torques or velocities, of sliding joints or turning ones.
+    # Choose the unit of the largest command: torque or velocity, of a sliding or turning joint.
     joint, command = max(report["largest_command"].items(), key=lambda pair: pair[1])
     by_torque = report["command"] == "torque"
     lengths = units.get(joint) == "m"
@@ -311,11 +313,11 @@ def format_report(report: dict[str, Any], problem: Problem) -> dict[str, str]:
 
 
 def format_fallback(report: dict[str, Any]) -> str | None:
-    """A sentence that says when and why the controller used its fallback; None if it never did."""
+    """A sentence about when and why the controller used its fallback; None if it did not."""
     fallback = report["fallback"]
     if fallback["since"] is None:
         return None
-    # A supervised law catches the arm, and may resume; others stay in their fallback.
+    # A supervised law catches the arm and may resume; other laws stay in their fallback.
     if report["catches"]:
         times = "once" if len(report["catches"]) == 1 else f"{len(report['catches'])} times"
         return (
@@ -330,7 +332,7 @@ def format_fallback(report: dict[str, Any]) -> str | None:
 
 
 def _evaluate_angles(chart: Chart, seen: Trajectory) -> dict[str, Any] | None:
-    """The paper's angles and the leak along the run; None where no gradient has a value."""
+    """The paper's angles and the leak along the run; None where no gradient is finite."""
     try:
         report = evaluate(chart, points=seen.q[np.isfinite(seen.q).all(axis=1)]).as_dict()
     except (SingularTaskError, InvalidValueError):
@@ -339,7 +341,7 @@ def _evaluate_angles(chart: Chart, seen: Trajectory) -> dict[str, Any] | None:
 
 
 def _evaluate_coupling(chart: Chart, reference: Reference, seen: Trajectory) -> dict[str, dict[str, float]]:
-    """Commanded -> disturbed -> index, for quantities that were commanded alone."""
+    """Commanded -> disturbed -> coupling index, for quantities that are commanded alone."""
     coupling = coupling_index(chart, reference, seen)
     columns = {
         commanded: {to: float(value) for to, value in zip(coupling.labels, column, strict=True) if isfinite(value)}
@@ -351,7 +353,7 @@ def _evaluate_coupling(chart: Chart, reference: Reference, seen: Trajectory) -> 
 def _find_worst_couplings(index: dict[str, dict[str, float]], task: tuple[str, ...]) -> str:
     """The worst disturbance of the task by an extra coordinate, and the reverse."""
     pairs = [(value, to, by) for by, column in index.items() for to, value in column.items()]
-    # The largest index of each kind: task by extra coordinates, and the reverse.
+    # Find the largest index of each direction: task by extra coordinates, and the reverse.
     texts = []
     for name, of_task in (("task <- extra", True), ("extra <- task", False)):
         chosen = [pair for pair in pairs if (pair[1] in task) == of_task and (pair[2] in task) != of_task]

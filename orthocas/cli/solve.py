@@ -1,4 +1,4 @@
-"""`orthocas solve`: joint positions with a task value and xi."""
+"""`orthocas solve`: finds joint positions from a task value and xi."""
 
 from pathlib import Path
 from typing import Annotated, Any
@@ -17,7 +17,8 @@ from orthocas.tasks.task import Task
 from orthocas.tools.checks import Array
 from orthocas.tools.json import clean
 
-_QUATERNION, _MATRIX = 7, 16  # numbers of a position and a quaternion, and of a 4 x 4 matrix
+# Numbers of a position with a quaternion, and of a 4 x 4 matrix.
+_QUATERNION, _MATRIX = 7, 16
 
 
 def solve(
@@ -40,7 +41,7 @@ def solve(
     every: Annotated[bool, typer.Option("--all", help="Of an arm: every posture with x and --xi.")] = False,
     json: AsJson = False,
 ) -> None:
-    """Find joint positions with a task value, and xi if it is given. Exit code 1 if there are none."""
+    """Find joint positions with a given task value and, optionally, xi. Exit code 1 if there are none."""
     near = None if start is None else parse_numbers("--start", start)
     if is_arm(file) or (str(file) in list_arms() and not file.exists()):
         arm = Arm.load(file)
@@ -68,7 +69,7 @@ def solve(
             found = chart.nearest_xi(q_start, target)
         else:
             found = chart.solve(x=target, xi=parse_numbers("--xi", xi, chart.r), q_start=near)
-        # Rows of bad input have no posture.
+        # A row with bad input has no posture.
         q, name = found.q[0], str(chart.notes.get("branch", ""))
         values = np.ravel(chart.xi(q)) if np.isfinite(q).all() else np.full(chart.r, np.nan)
         rows = [(q, values, found.status[0], name)]
@@ -76,8 +77,8 @@ def solve(
 
 
 def _read_target(task: Task, text: str) -> Array:
-    """The task's vector of the numbers of --x."""
-    # A matrix, a position with a quaternion, or the task's own numbers: told apart by how many there are.
+    """The task's vector from the numbers of --x."""
+    # The count of numbers distinguishes a matrix, a position with a quaternion, and the task's own numbers.
     numbers = parse_numbers("--x", text)
     if len(numbers) == _MATRIX:
         return task.target(numbers.reshape(4, 4))
@@ -89,8 +90,8 @@ def _read_target(task: Task, text: str) -> Array:
 
 
 def _print(rows: list[tuple[Array, Array, Any, str]], json: bool) -> None:
-    """One posture, or several; exit code 1 for none."""
-    # The same postures as data, then as text, with numbers that options take back.
+    """Print one or several postures; exit code 1 if there is none."""
+    # Print the same postures as data or as text, with numbers that options accept.
     found = [
         {"q": clean(q), "xi": clean(xi), "status": InverseStatus(int(status)).name, "branch": branch}
         for q, xi, status, branch in rows
@@ -107,11 +108,11 @@ def _print(rows: list[tuple[Array, Array, Any, str]], json: bool) -> None:
         named = {f"branch{label}": branch} if branch and not missed else {}
         texts = {f"q{label}": "none" if missed else _write(q), f"xi{label}": xi_text, **named}
         print_rows({f"status{label}": InverseStatus(int(status)).name, **texts})
-    # The exit code says whether there is a posture with x.
+    # The exit code is 1 if no posture has the task value x.
     if not any(np.isfinite(q).all() and status <= InverseStatus.OUTSIDE_DOMAIN for q, _, status, _ in rows):
         raise typer.Exit(1)
 
 
 def _write(values: Array) -> str:
-    """Numbers as options take them."""
+    """Numbers in the form that options accept."""
     return ",".join(f"{value:.9g}" for value in values)

@@ -32,7 +32,8 @@ from orthocas.viewer.view import PORT, export_page, require_page
 from orthocas.viewer.window import LOCAL, is_local, require_free
 
 _PORT = "0: any free one. HOST: the address to listen at; 0.0.0.0 is open to the network."
-_RUN = "trajectory.npz"  # in the folders of `orthocas simulate`
+# File in the folders of `orthocas simulate`.
+_RUN = "trajectory.npz"
 
 
 @spread("words", ProblemOptions, "tip", "lock")
@@ -77,9 +78,9 @@ def view(
     # CasADi may lose Ctrl-C while it builds functions.
     with deferred():
         scene = _read_scene(target, chart, robot, words)
-    # What is shown: a chart with a path to play, a motion, or a robot.
+    # Show a chart, optionally with a path, or a motion, or a robot.
     if compare:
-        # Motions along a closed path instead of a chart.
+        # Compare motions along a closed path.
         if not isinstance(scene.shown, Chart):
             raise OptionError("--compare requires a chart file, whose coordinates are compared")
         points = None if path is None else read_path(path, scene.shown)[0]
@@ -88,7 +89,7 @@ def view(
         played = _read_played(scene, path, export)
     arm, meshes, locks = scene.robot, scene.meshes, scene.locked
     model = _build_model(scene, solids, export)
-    # A page that works offline, or one that is served until Ctrl-C.
+    # Write a page that works offline, or serve a page until Ctrl-C.
     if export is not None:
         shape = export_page(scene.shown, export, robot=arm, robot_file=meshes, locked=locks, force=force)
         _note_missing(shape.missing)
@@ -114,7 +115,7 @@ def view(
 
 @dataclass(frozen=True)
 class _Scene:
-    """What the page shows, and whose it is."""
+    """The object that the page shows, and its robot."""
 
     shown: Any
     robot: Robot | Chart | None
@@ -123,20 +124,20 @@ class _Scene:
 
 
 def _read_scene(target: str, chart: Path | None, meshes: Path | None, words: ProblemOptions) -> _Scene:
-    """What the target is: by its suffix, or a folder of a run, or the name of a problem."""
+    """Read the target: a file by its suffix, the folder of a run, or the name of a problem."""
     place = Path(target)
     locked = words.parse_locks()
-    # A robot without a chart has a slider for each joint.
+    # A robot without a chart gets a slider for each joint.
     if is_robot_file(target):
         meshes = place if meshes is None and place.suffix.lower() == ".urdf" else meshes
         return _Scene(words.build_robot(target), None, meshes, locked)
     if target in problems.names() and not place.exists():
         words.require_no_robot(f"the named problem '{target}'")
         return _Scene(problems.get(target).robot, None, meshes, locked)
-    # Motions move a robot that their files do not hold.
+    # Files of motions do not contain the robot.
     if place.is_dir() or place.suffix.lower() in (".npz", ".csv", ".mcap"):
         if chart is None and meshes is None:
-            raise OptionError("files of motions hold no robot: give --chart or --robot")
+            raise OptionError("files of motions do not contain a robot: give --chart or --robot")
         owner = words.build_robot(str(meshes)) if chart is None else load(chart)
         arm = owner.problem.robot if isinstance(owner, Chart) else owner
         file = place / _RUN if place.is_dir() else place
@@ -148,11 +149,11 @@ def _read_scene(target: str, chart: Path | None, meshes: Path | None, words: Pro
 
 
 def _read_played(scene: _Scene, path: Path | None, export: Path | None) -> Array | None:
-    """The waypoints that the page of a chart plays, with their coordinates if the file has them."""
+    """The waypoints that the page of a chart plays, with coordinates if the file has them."""
     if path is None:
         return None
     if not isinstance(scene.shown, Chart) or export is not None:
-        raise OptionError("--path is for live pages of charts, or with --compare: leave it out")
+        raise OptionError("--path requires a live page of a chart, or --compare: leave it out")
     x, xi = read_path(path, scene.shown)
     return x if xi is None else np.hstack([x, xi])
 
@@ -162,7 +163,7 @@ def _build_model(scene: _Scene, solids: SolidOptions, export: Path | None) -> Co
     if isinstance(scene.shown, Chart) and export is None:
         return solids.build_model(scene.shown.robot)
     if solids != SolidOptions():
-        raise OptionError("--collisions is for live pages of charts: leave it out")
+        raise OptionError("--collisions requires a live page of a chart: leave it out")
     return None
 
 

@@ -1,4 +1,4 @@
-"""CasADi functions and integrators compiled for this process; libraries are kept for equal code."""
+"""CasADi functions and integrators compiled for this process; equal code shares one library."""
 
 import ctypes
 from collections.abc import Sequence
@@ -17,7 +17,7 @@ from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array
 from orthocas.tools.interrupts import deferred
 
-# -O3 takes twice as long, and gains little.
+# -O3 takes twice as long to compile, and gains little.
 _FLAGS = ("-O2",)
 _PREFIX = "kernel"
 _ENTRY = """int {name}(const double **arg, double **res, int *iw, double *w) {{
@@ -28,7 +28,7 @@ _STAGES = 12
 
 
 class Kernel(ctypes.Structure):
-    """`kernel` of templates/runner.c.jinja: a function with its own work arrays, for one thread."""
+    """The struct `kernel` of templates/runner.c.jinja: a function with its own work arrays, for one thread."""
 
     _fields_ = (
         ("run", ctypes.c_void_p),
@@ -37,17 +37,18 @@ class Kernel(ctypes.Structure):
         ("iw", ctypes.c_void_p),
         ("w", ctypes.c_void_p),
     )
-    _alive: tuple[Any, ...]  # what the pointers point to
+    # Keeps the targets of the pointers alive.
+    _alive: tuple[Any, ...]
 
 
 class CompiledFunctions:
-    """Dense functions of columns in one shared library. Threads may share it.
+    """Dense functions of columns in one shared library, which threads may share.
 
     Args:
-        functions: functions with different names. Inputs and outputs are columns.
+        functions: functions with different names, whose inputs and outputs are columns.
 
     Raises:
-        CompileError: as `keep_library`.
+        CompileError: as in `keep_library`.
     """
 
     def __init__(self, functions: Sequence[ca.Function]) -> None:
@@ -60,13 +61,13 @@ class CompiledFunctions:
         self.library = keep_library("functions", {"functions.c": code}, _FLAGS)
 
     def kernel(self, name: str, constants: Sequence[Array | None] = ()) -> Kernel:
-        """A function for compiled code.
+        """A kernel for compiled code.
 
         Args:
-            name: of the function.
-            constants: inputs that stay; None for those that the caller sets.
+            name: name of the function.
+            constants: fixed inputs; None for those that the caller sets.
         """
-        # Work arrays of its own, and constants that live as long as the kernel.
+        # The kernel owns its work arrays, and keeps the constants alive.
         arg, res, iw, w = (max(1, size) for size in self._work[name])
         arguments, results = (ctypes.c_void_p * arg)(), (ctypes.c_void_p * res)()
         integers, doubles = np.zeros(iw, dtype=np.intc), np.zeros(w)
@@ -81,12 +82,12 @@ class CompiledFunctions:
         return result
 
     def rows(self, name: str, *arguments: Array) -> list[Array]:
-        """Evaluate a function for N rows of each argument, (N, size) or, where all rows are equal, (size,)."""
+        """Evaluate a function for N rows of each argument: (N, size), or (size,) for an argument equal in all rows."""
         N = max(len(argument) for argument in arguments if argument.ndim == 2)
         kernel = self.kernel(name, [None] * len(arguments))
         inputs = [np.ascontiguousarray(argument, dtype=float) for argument in arguments]
         outputs = [np.empty((N, size)) for size in self._outputs[name]]
-        # Pointers to inputs and outputs, and from row to row a stride, 0 where all rows are equal.
+        # Pointers to inputs and outputs, and strides from row to row, which are 0 if all rows are equal.
         places = [
             (ctypes.c_void_p * len(arrays))(*(array.ctypes.data for array in arrays)) for arrays in (inputs, outputs)
         ]
@@ -106,7 +107,7 @@ class CompiledFunctions:
 
 @cache
 def get_runner(name: str) -> Any:
-    """A function of templates/runner.c.jinja, which calls kernels."""
+    """A function of templates/runner.c.jinja that calls kernels."""
     method = scipy.integrate.DOP853
     tables = {"a": method.A, "b": method.B, "c": method.C, "e3": method.E3[:-1], "e5": method.E5[:-1]}
     source = render("runner.c", tables)
@@ -114,7 +115,7 @@ def get_runner(name: str) -> Any:
 
 
 class _State(ctypes.Structure):
-    """`loop` of templates/runner.c.jinja."""
+    """The struct `loop` of templates/runner.c.jinja."""
 
     _fields_ = (
         *((name, Kernel) for name in ("law", "plant", "profile")),
@@ -125,13 +126,13 @@ class _State(ctypes.Structure):
 
 
 class Integrator:
-    """Dormand and Prince's method of order 8 for a closed loop, for one thread. It remembers the length of its steps.
+    """Dormand and Prince's method of order 8 for a closed loop, in one thread. It keeps its step length between calls.
 
     Args:
-        kernels: law, plant and profile of the reference.
-        sizes: numbers of joints, quantities, of a state, and of a load.
-        tolerance: of a step, relative and absolute.
-        step: to try first [s].
+        kernels: law, plant, and profile of the reference.
+        sizes: number of joints, number of quantities, size of the state, size of a load.
+        tolerance: relative and absolute tolerance of a step.
+        step: length of the first step [s].
     """
 
     def __init__(
@@ -149,10 +150,10 @@ class Integrator:
         Args:
             parts: number of parts.
             span: begin and end [s].
-            since: when the segment of the reference began [s].
-            parameters: of the segment.
-            load: a row of the loads.
-            start: state at the begin, (s,).
+            since: start time of the segment of the reference [s].
+            parameters: parameters of this segment.
+            load: one row of the loads.
+            start: initial state, (s,).
 
         Raises:
             SimulationError: if the steps become too short.
@@ -168,7 +169,7 @@ class Integrator:
 
         Args:
             period: length of a tick [s].
-            start: state at the begin, (s,).
+            start: initial state, (s,).
             columns: references with derivatives (N, 3 k), noise (N, s) and loads.
 
         Raises:
@@ -184,4 +185,4 @@ class Integrator:
         with deferred():
             failed = get_runner(name)(ctypes.byref(self._state), *pointers)
         if failed:
-            raise SimulationError("the integrator gave up: its steps became too short, or too many")
+            raise SimulationError("the integrator failed: it needs too many or too short steps")

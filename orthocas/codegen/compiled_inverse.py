@@ -24,30 +24,30 @@ from orthocas.tools.checks import Array, require_kind
 from orthocas.tools.display import Shown
 from orthocas.tools.files import open_draft_folder
 
-# No warnings as errors: compilers doubt pointers of CasADi that pass the end of an array.
+# Warnings are not errors here, because compilers warn about CasADi's pointers past the end of an array.
 _FLAGS = ("-O3",)
 _ROWS = "inverse_rows.c"
-# Evaluations of phi; few where another search follows.
+# Largest number of evaluations of phi; the second is for searches that another search follows.
 _ITERATIONS, _FEW_ITERATIONS = 100, 12
-# Rows that a thread takes at once.
+# Rows per task of a thread.
 _PIECE = 512
 
 
 def compile_inverse(chart: Chart, folder: str | Path | None = None) -> CompiledInverse:
-    """Compile the inverse map of a chart, or find it compiled earlier; for large batches.
+    """Compile the inverse map of a chart, or load it if it was compiled before; for large batches.
 
     The first call for a chart generates and compiles C, which takes some seconds. Later calls, also in other processes,
-    find the library in the folder: its name is a digest of the C code, the compiler and its options.
+    find the library in the folder by its name, which is a digest of the C code, the compiler and its options.
 
     Args:
         chart: a chart with a closed expression.
-        folder: where compiled libraries are kept; default `orthocas/libraries` in $XDG_CACHE_HOME
-            or ~/.cache. Only the user and root may be able to write there.
+        folder: cache of compiled libraries; default `orthocas/libraries` in $XDG_CACHE_HOME or ~/.cache. Only the user
+            and root may have the right to write there.
 
     Raises:
         CompileError: if there is no C compiler, or others may write to the folder.
         NoExpressionError: if the chart is grown.
-        InvalidValueError: if the folder cannot be written.
+        InvalidValueError: if the folder is not writable.
 
     Example:
         >>> from tempfile import TemporaryDirectory
@@ -61,26 +61,26 @@ def compile_inverse(chart: Chart, folder: str | Path | None = None) -> CompiledI
         [True, True]
     """
     require_kind("chart", chart, Chart)
-    # the library of the chart, then what takes many rows; what follows curves is a library of its own
+    # The library of the chart and a loop over many rows; the tracer of self-motions is a separate library.
     with open_draft_folder() as drafts:
         generate_c(chart, drafts, name="arm")
         sources = {path.name: path.read_text(encoding="utf-8") for path in sorted(drafts.glob("*.[hc]"))}
     sources[_ROWS] = get_source(_ROWS)
     library = keep_library("inverse", sources, (*_FLAGS, f"-DN={chart.n}"), folder)
-    # compiled now, so that no later call waits for it
+    # Compile it now, so that no later call waits for it.
     has_library(SearchKernel(chart, library.parent))
     return CompiledInverse(chart, library)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class CompiledInverse(Shown):
-    """`Chart.solve` and `Chart.nearest_xi` in compiled C; `orthocas.compile_inverse` makes it."""
+    """`Chart.solve` and `Chart.nearest_xi` in compiled C, built by `orthocas.compile_inverse`."""
 
     chart: Chart
     library: Path  #: the shared library
 
     def facts(self) -> dict[str, str]:
-        """What `str` shows: the chart's problem and the file of the library."""
+        """The chart's problem and the file of the library."""
         return {"inverse": f"compiled, of the chart of {self.chart.problem.name}", "library": str(self.library)}
 
     def solve(
@@ -93,7 +93,7 @@ class CompiledInverse(Shown):
         tolerance: float = 1e-9,
         inside: bool = False,
     ) -> Solutions:
-        """Solve like `Chart.solve`: the same status for each row and the same q to 1e-9, unless starts are far away."""
+        """Solve like `Chart.solve`, with equal statuses and equal q to 1e-9, unless starts are far away."""
         return solve_rows(self.chart, self._parts, build_phi(self.chart, phi, x, xi), q_start, tolerance, inside)
 
     def nearest_xi(self, q_wish: ArrayLike, x: Any = None, *, tolerance: float = 1e-9) -> Solutions:
@@ -103,7 +103,7 @@ class CompiledInverse(Shown):
 
     @cached_property
     def _parts(self) -> Inverse:
-        """The parts of the chart, with compiled searches in their places."""
+        """The parts of the chart's inverse map, with compiled searches."""
         parts = self.chart.parts.inverse
         curves = parts.curves
         if curves is not None:
@@ -114,7 +114,7 @@ class CompiledInverse(Shown):
     def _search(self, iterations: int, targets: Array, starts: Array) -> Attempt:
         """Search from starts (N, n) in C."""
         N, phi_map = len(targets), self.chart.parts.phi_map
-        # C reads rows one after the other, whatever the order of the targets.
+        # C expects contiguous rows, whatever the memory order of the targets.
         q, residual, condition = starts.copy(), np.empty(targets.shape), np.empty(N)
         inside = np.empty(N, dtype=np.bool_)
         arrays = np.ascontiguousarray(targets), q, residual, condition, inside
@@ -126,7 +126,7 @@ class CompiledInverse(Shown):
 
         run_in_threads(solve_piece, range(0, N, _PIECE))
         attempt = Attempt(q, residual, np.ones(N, dtype=np.int64), ~(condition < NEWTON.suspicious), inside)
-        # Where C finds nothing, NumPy finds how near one can get; rows for which another search follows stay there.
+        # Where C finds no solution, NumPy finds the nearest point, unless another search follows.
         failed = np.flatnonzero(condition < 0)
         if failed.size and iterations == _FEW_ITERATIONS:
             residual[failed] = phi_map.residual(targets[failed], starts[failed])

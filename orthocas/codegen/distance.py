@@ -1,4 +1,4 @@
-"""The least distance between a robot's links in C and in exported modules: of capsules that contain them."""
+"""Least distances between a robot's links, by capsules that contain them, in C and in exported modules."""
 
 from __future__ import annotations
 
@@ -26,13 +26,14 @@ from orthocas.tools.display import listed
 class DistanceRules:
     """Numbers of distances in C."""
 
-    postures: int = 2000  #: by which pairs are put into the order of how often they are the nearest
-    seed: int = 0  #: of them
-    grown: float = 1e-9  #: of the balls around links, relative: more than rounding
-    locals_bytes: int = 1024  #: of stack for other variables
-    rounds: int = 16  #: distances by which a way is checked, at most
-    resolution: float = 1e-6  #: [m]: nearer to what is kept counts as too near
-    parallel: float = 1e-6  #: of the squared sine between two axes in modules, which may have single precision
+    postures: int = 2000  #: random postures that sort pairs by how often each is the nearest
+    seed: int = 0  #: seed of these postures
+    grown: float = 1e-9  #: relative enlargement of the balls around links, which covers rounding
+    locals_bytes: int = 1024  #: stack for other variables [bytes]
+    rounds: int = 16  #: largest number of distances for checking a motion
+    resolution: float = 1e-6  #: [m]; distances less than this above the clearance count as too near
+    #: squared sine of an angle below which axes count as parallel in modules, which may use single precision
+    parallel: float = 1e-6
     least_square: float = 1e-18  #: [m^2], keeps square roots in modules differentiable
 
 
@@ -40,12 +41,12 @@ RULES = DistanceRules()
 
 
 def render_distance(fitted: FittedCapsules, values: Mapping[str, Any], precision: Precision) -> dict[str, str]:
-    """NAME_distance.h and NAME_distance.c.
+    """The contents of NAME_distance.h and NAME_distance.c.
 
     Args:
-        fitted: the capsules.
-        values: of other templates of the library: name, NAME, version, farthest and largest.
-        precision: of their numbers.
+        fitted: the fitted capsules.
+        values: values of the library's other templates: name, NAME, version, farthest and largest.
+        precision: number type.
     """
     model = fitted.collisions
     tree, names = model.tree, list(dict.fromkeys(part.name for part in model.parts))
@@ -80,7 +81,7 @@ def render_distance(fitted: FittedCapsules, values: Mapping[str, Any], precision
         (plane_pairs if kind == "plane" else pairs).append((numbers[first][1], place, number))
 
     def up(value: float) -> float:
-        # The next larger float than a radius in double, and what the rounding of places adds.
+        # Round a radius up, and add the rounding errors of positions.
         if precision.scalar is np.float64:
             return value
         return float(precision.next_above(np.array([value * (1 + 4 * precision.rounding)]))[0])
@@ -123,7 +124,7 @@ def render_distance(fitted: FittedCapsules, values: Mapping[str, Any], precision
 
 
 def bound_distance_stack(fitted: FittedCapsules, size: int) -> int:
-    """Bytes of stack of a call of NAME_distance, at most: places of joints, links and capsules in numbers of `size`."""
+    """Upper bound of the stack of NAME_distance [bytes]: poses of joints, links and capsules of `size` bytes."""
     model = fitted.collisions
     names = [part.name for part in model.parts if part.shape.bounded]
     links = len(set(names))
@@ -134,7 +135,7 @@ def build_distance_form(fitted: FittedCapsules) -> Form:
     """The functions `distance` and `pair_distances` of an exported module."""
     model = fitted.collisions
     tree, parts = model.tree, [part for part in model.parts if part.shape.bounded]
-    # Poses of the bodies, and of the world, which comes last.
+    # Poses of the bodies, and of the world as the last one.
     q = ca.SX.sym("q", tree.n)
     poses = [*build_body_poses(tree, q), (ca.SX.eye(3), ca.SX.zeros(3))]
     rows = ca.vertcat(*(ca.vec(ca.horzcat(rotation, translation).T) for rotation, translation in poses))
@@ -146,12 +147,12 @@ def build_distance_form(fitted: FittedCapsules) -> Form:
     own: dict[str, list[int]] = {}
     for k, part in enumerate(parts):
         own.setdefault(part.name, []).append(k)
-    # Pairs of capsules, as many for each pair of names: the last one counts several times.
+    # Pairs of capsules, equally many for each pair of names; the last one is repeated where there are fewer.
     pairs = [(k, pair) for k, pair in enumerate(model.pairs) if pair[1] in own]
     rows_of = [[(i, j) for i in own[a] for j in own[b]] for _, (a, b) in pairs]
     most = max(map(len, rows_of), default=1)
     numbers = np.array([[*row, *(most - len(row)) * [row[-1]]] for row in rows_of], dtype=int).reshape(-1, 2)
-    # Half-spaces: normals and offsets.
+    # Half-spaces, as normals and offsets.
     solids = {part.name: part.shape for part in model.parts}
     planes = [(k, pair) for k, pair in enumerate(model.pairs) if pair[1] not in own]
     most_planes = max((len(own[first]) for _, (first, _) in planes), default=1)
@@ -190,11 +191,11 @@ def build_distance_form(fitted: FittedCapsules) -> Form:
     return Form("distance", values, code, tables, indices)
 
 
-_BOX = ((np.min, -1.0), (np.max, 1.0))  #: how a box around balls begins and ends
+_BOX = ((np.min, -1.0), (np.max, 1.0))  #: how to find the lower and the upper corner of a box around balls
 
 
 def _order_pairs(model: Collisions) -> list[int]:
-    """Numbers of the pairs, those first that are the nearest most often in seeded postures."""
+    """Indices of the pairs, sorted by how often each is the nearest in random postures."""
     counts = np.zeros(len(model.pairs), dtype=int)
     if len(model.pairs):
         near = model.distance(Robot(model.tree).sample(RULES.postures, RULES.seed)).pair

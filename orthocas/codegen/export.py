@@ -1,4 +1,4 @@
-"""`export`: charts and torque laws as small modules of NumPy, PyTorch or JAX that do not need orthocas."""
+"""`export`: charts and torque laws as small modules for NumPy, PyTorch or JAX that do not need orthocas."""
 
 from __future__ import annotations
 
@@ -32,9 +32,9 @@ from orthocas.version import VERSION
 _COMMON = ("from base64 import b64decode", "from functools import cache")
 _ROUNDS = "LAST_ROUNDS = 2  # of the inverse, at a solution: two, so that third derivatives are right\n"
 _SHARED = re.compile(r"_shared\((.*), q\)$", re.MULTILINE)
-# Characters of a line of base64.
+# Characters per line of base64.
 _WIDTH = 100
-TORQUE_LAWS = (Impedance, PDPlus)  #: that can be exported
+TORQUE_LAWS = (Impedance, PDPlus)  #: laws that can be exported
 _LAW_STATUSES = ("OK", "OUTSIDE_DOMAIN", "SINGULAR", "NOT_FINITE", "SATURATED")
 
 
@@ -45,32 +45,32 @@ def export(
     force: bool = False,
     capsules: FittedCapsules | None = None,
 ) -> Path:
-    """Write a chart as a Python module that needs one library only: "numpy", "torch" or "jax".
+    """Write a chart as a Python module that needs only one library: "numpy", "torch" or "jax".
 
-    The module has the functions `task`, `xi`, `phi` and `jacobian` of joint positions (n,) or (N, n), as a chart does,
-    `inverse` of phi from given starts, and `nearest_xi`. Numbers are those of the chart to rounding. With PyTorch and
-    JAX they are differentiable, run on GPUs, and keep the precision of q; see docs/how-to/export.md.
+    The module has the functions `task`, `xi`, `phi` and `jacobian` of joint positions (n,) or (N, n), like a chart,
+    `inverse` of phi from given starts, and `nearest_xi`. Results equal those of the chart up to rounding. With PyTorch
+    and JAX, the functions are differentiable, run on GPUs, and keep the precision of q; see docs/how-to/export.md.
 
-    For `control.PDPlus` and `control.Impedance`, and PyTorch or JAX, the module of the law's chart also has `command`,
-    the torques of the law with their status.
+    For `control.PDPlus` and `control.Impedance` with PyTorch or JAX, the module also has `command`, the torques of the
+    law with their status.
 
     Args:
         chart: a chart with a closed expression, or one of these laws on such a chart.
         to: the library.
-        path: the file to write, NAME.py. It replaces an exported module of that name.
+        path: the output file NAME.py. It replaces an exported module of that name.
         force: replace any other file too.
-        capsules: of `oc.fit_capsules(robot.collisions)`: the module also has `distance`, the least distance of the
-            capsules around the links, and `pair_distances`, those of all pairs.
+        capsules: result of `oc.fit_capsules(robot.collisions)`. The module then has `distance`, the least distance
+            between the capsules of the links, and `pair_distances`, the distances of all pairs.
 
     Returns:
         The path of the file.
 
     Raises:
-        NoExpressionError: if the chart is grown. `orthocas.distil` fits an expression to it.
+        NoExpressionError: if the chart is grown. `orthocas.distil` fits an expression to such a chart.
         UnknownNameError: if there is no such library.
-        InvalidValueError: if the path is not that of a module, or has the name of the library; for laws with inputs at
-            run time, and for laws with NumPy; for capsules of another robot, or without pairs.
-        ArchiveError: if the file cannot be written, or there is one that was not exported.
+        InvalidValueError: if the path is not NAME.py, or NAME is that of the library; if a law has inputs at run time,
+            or is exported to NumPy; if the capsules belong to another robot, or have no pairs.
+        ArchiveError: if the file cannot be written, or an existing file was not exported.
 
     Example:
         >>> from tempfile import TemporaryDirectory
@@ -84,7 +84,7 @@ def export(
     if not isinstance(chart, TORQUE_LAWS):
         require_kind("chart", chart, Chart)
     require_known("library", to, LIBRARIES)
-    # A file of that name is replaced only if it was exported, unless forced.
+    # Replace an existing file only if it was exported, or if forced.
     target = as_path("path", path)
     if target.suffix != ".py" or not target.stem.isidentifier() or target.stem in LIBRARIES:
         raise InvalidValueError("path", repr(str(target))[:200], f"a module NAME.py, other than {to}.py")
@@ -100,17 +100,17 @@ def export(
 
 
 def write_module(chart: Chart | Impedance | PDPlus, to: str, capsules: FittedCapsules | None = None) -> str:
-    """The module as text."""
+    """The text of the module."""
     if capsules is not None:
         require_kind("capsules", capsules, FittedCapsules)
         capsules.collisions.require_for((chart if isinstance(chart, Chart) else chart.chart).problem.robot.tree)
         if not capsules.collisions.pairs:
-            raise InvalidValueError("capsules", "without pairs", "pairs of links")
-    # A law comes with its chart.
+            raise InvalidValueError("capsules", "a model without pairs", "a model with pairs of links")
+    # A law is exported with its chart.
     laws = []
     if isinstance(chart, TORQUE_LAWS):
         if to == "numpy":
-            raise InvalidValueError("library", "'numpy'", "'torch' or 'jax' for a law, which differentiates")
+            raise InvalidValueError("library", "'numpy'", "'torch' or 'jax', because laws need derivatives")
         laws, chart = [_build_law(chart)], chart.chart
     library, problem, task = LIBRARIES[to], chart.problem, chart.problem.task
     distances = [] if capsules is None else [build_distance_form(capsules)]
@@ -123,7 +123,7 @@ def write_module(chart: Chart | Impedance | PDPlus, to: str, capsules: FittedCap
         "task": task_code.strip("\n"),
         "others": "\n\n\n".join(map(_write_form, others)),
     }
-    # Names and numbers about the chart, as Python that is plain ASCII.
+    # Names and numbers of the chart, as Python code in plain ASCII.
     values = {
         "to": to,
         "library": library,
@@ -150,20 +150,24 @@ def write_module(chart: Chart | Impedance | PDPlus, to: str, capsules: FittedCap
 
 
 def _write_form(form: Form) -> str:
-    """The functions of a form."""
+    """The functions of a form as text."""
     return f"{render(f'{form.template}.py', form.values)}\n\n{form.functions}".strip("\n")
 
 
 def _build_law(law: Impedance | PDPlus) -> Form:
-    """The function `command`, and what it calls beside the functions of phi and of the inverse.
+    """The function `command`, and the functions that it calls in addition to those of phi and of the inverse.
 
     Raises:
         InvalidValueError: if the law takes inputs at run time, such as a payload or a given mass matrix.
     """
     model, n, m = law.model, law.chart.n, law.chart.m
     if model.gains(law.problem, law.feed_forward):
-        raise InvalidValueError("model of the law", ", ".join(model.gains(law.problem, law.feed_forward)), "its own")
-    # Numbers of the law as columns; joints that turn without end count their turns.
+        raise InvalidValueError(
+            "model of the law",
+            ", ".join(model.gains(law.problem, law.feed_forward)),
+            "a law without inputs at run time",
+        )
+    # Numbers of the law as columns; full turns of endless joints are counted.
     bound, domain = law.problem.domain.reach, law.problem.domain
     stiffness = law.stiffness if law.damping_stiffness is None else law.damping_stiffness
     turn = np.zeros(law.problem.n)
@@ -178,7 +182,7 @@ def _build_law(law: Impedance | PDPlus) -> Form:
     }
     tables = {name: value[:, None] for name, value in columns.items()}
     tables["reach"] = np.array([domain.centre - bound, domain.centre + bound])[:, :, None]
-    # Choices that are words or scalars.
+    # Options of the law.
     values = {
         "formula": law.formula,
         "feed_forward": law.feed_forward,
@@ -196,8 +200,8 @@ def _build_law(law: Impedance | PDPlus) -> Form:
 
 
 def _write_law_functions(law: Impedance | PDPlus) -> list[str]:
-    """Code of the errors, and of the robot's matrices and torques."""
-    # Symbols of the state, of a velocity of the joints, and of the targets of the task.
+    """Code for the errors, and for the robot's matrices and torques."""
+    # Symbols of the state, of a joint velocity, and of the task targets.
     chart, n, m = law.chart, law.chart.n, law.chart.m
     q, dq, w = (ca.MX.sym(name, n) for name in ("q", "dq", "w"))
     x_d, dx_d, ddx_d = (ca.MX.sym(name, m) for name in ("x_d", "dx_d", "ddx_d"))
@@ -251,14 +255,14 @@ _BEND = '''def _bend(q, dq, w, wanted):
 
 
 def _write_graph(name: str, summary: str, inputs: list[ca.MX], outputs: list[ca.MX]) -> str:
-    """A Python function of columns of the inputs, one below the other."""
+    """A Python function whose argument holds the columns of all inputs, one below the other."""
     graph = ca.Function("graph", inputs, [ca.densify(ca.vertcat(*outputs))])
     symbols = [ca.SX.sym("s", part.numel()) for part in inputs]
     return write_function(name, summary, dense_function("f", [ca.vertcat(*symbols)], [graph(*symbols)]))
 
 
 def _encode(table: Array) -> list[str]:
-    """Lines of base64 with the numbers of a table."""
+    """The numbers of a table as lines of base64."""
     # Adding 0.0 turns -0.0 into 0.0.
     text = b64encode((np.asarray(table, dtype="<f8") + 0.0).tobytes()).decode()
     return [text[k : k + _WIDTH] for k in range(0, max(len(text), 1), _WIDTH)]
@@ -266,27 +270,28 @@ def _encode(table: Array) -> list[str]:
 
 @dataclass(frozen=True)
 class Library:
-    """A library with the functions of NumPy under its own name. `templates/NAME.py.jinja` has what it needs besides."""
+    """A library with NumPy's functions under its own name; `templates/NAME.py.jinja` has the other code it needs."""
 
     title: str
-    prefix: str  #: of its functions in code
-    imports: tuple[str, ...]  #: the standard library, an empty line, others
-    erf: tuple[str, str]  #: its error function, and what that imports
+    prefix: str  #: prefix of its functions in code
+    imports: tuple[str, ...]  #: imports of the standard library, an empty line, other imports
+    erf: tuple[str, str]  #: name of its error function, and the import for it
     constants: str
     note: str
-    tables: str = ""  #: what is made of the numbers when the module is imported
-    names: Mapping[str, str] = field(default_factory=dict)  #: of functions that have another one than in NumPy
-    fuses: bool = False  #: whether it computes shared values again for everything that needs them, if we let it
+    tables: str = ""  #: code that prepares the tables when the module is imported
+    names: Mapping[str, str] = field(default_factory=dict)  #: functions with another name than in NumPy
+    #: whether its compiler may recompute shared values for each use, so that this must be prevented
+    fuses: bool = False
 
     def translate(self, text: str) -> str:
-        """Code for NumPy as code for this library."""
+        """Translate code for NumPy to this library."""
         text = text if self.fuses else _SHARED.sub(r"\1", text)
         for name, own in self.names.items():
             text = text.replace(f"np.{name}(", f"{self.prefix}.{own}(")
         return re.sub(r"\bnp\.", f"{self.prefix}.", text).replace("_erf(", f"{self.erf[0]}(")
 
     def imports_for(self, code: str) -> str:
-        """The imports that a module's code, still for NumPy, needs."""
+        """The imports that a module needs, from its code for NumPy."""
         lines = list(self.imports)
         if "_erf(" in code and self.erf[1] not in lines:
             lines.insert(0 if self.erf[1] == "import math" else lines.index("") + 1, self.erf[1])
@@ -310,7 +315,7 @@ LIBRARIES = {
         erf=("torch.erf", "import torch"),
         constants="ROWS = 8192  # joint positions at once, so that memory stays bounded; raise it on a GPU\n" + _ROUNDS,
         note="q is a floating-point tensor. Results have its precision and device, and are differentiable.",
-        # torch.func.vmap does not know the former.
+        # torch.func.vmap does not support moveaxis.
         names={"moveaxis": "movedim"},
         tables="""
 with torch.inference_mode(False):  # what is made in that mode has no derivatives later

@@ -1,7 +1,7 @@
-"""What exported modules consist of, as lines of NumPy, PyTorch or JAX.
+"""Parts of exported modules, as lines of code for NumPy, PyTorch or JAX.
 
-Coordinates are tables of products, networks, or tapes. The inverse has errors of phi, how fast phi moves, and numbers
-that are positive where solutions count as found.
+Coordinates are tables of products, networks, or tapes. The inverse needs errors of phi, rates of phi, and numbers that
+are positive at accepted solutions.
 """
 
 from collections.abc import Iterable, Mapping, Sequence
@@ -23,21 +23,21 @@ from orthocas.tools.batch import dense_function
 from orthocas.tools.checks import Array
 from orthocas.tools.expressions import ARITHMETIC, Tape, write_tape
 
-#: those of `InverseStatus` in modules
+#: statuses in modules, as in `InverseStatus`
 STATUSES = ("FOUND", "NEAREST", "OUTSIDE_DOMAIN", "LIMIT", "NOT_FOUND", "BAD_INPUT")
-# Of the half-widths: rounding at boundaries and joint limits.
+# Tolerance for rounding at boundaries and joint limits, in half-widths.
 _SLACK = 1e-9
-# Gradients that differ by less at so many points count as the same.
+# Gradients are equal if they differ by less than this at this many points.
 _PARALLEL, _POINTS = 1e-12, 8
 
 
 @dataclass(frozen=True, eq=False)
 class Form:
-    """The functions `_xi` and `_xi_jacobian` of columns q (n, N): a template, and what it uses."""
+    """The functions `_xi` and `_xi_jacobian` of columns q (n, N), as a template with its values."""
 
     template: str  #: name of a file in templates/
-    values: Mapping[str, Any]  #: that it is filled with
-    functions: str  #: further functions
+    values: Mapping[str, Any]  #: values for the template
+    functions: str  #: code of further functions
     tables: Mapping[str, Array]
     indices: Mapping[str, Sequence[int]]
 
@@ -50,11 +50,11 @@ def build_form(chart: Chart) -> Form:
     """
     coordinates = chart.coordinates
     if isinstance(coordinates, Coordinates) and len(coordinates.offset):
-        # Tables in place of many thousand lines.
+        # Tables replace many thousand lines of code.
         form = _build_network(coordinates) or _build_products(coordinates)
         if form is not None:
             return form
-    # Otherwise, xi and its Jacobian operation by operation.
+    # Otherwise, write xi and its Jacobian operation by operation.
     q, xi = ca.SX.sym("q", chart.n), chart.function("xi")
     slopes = dense_function("J_xi", [q], [chart.function("jacobian")(q)[chart.m :, :]])
     code = [
@@ -65,16 +65,16 @@ def build_form(chart: Chart) -> Form:
 
 
 def _build_products(coordinates: Coordinates) -> Form | None:
-    """xi = C psi + A q + c and J_xi = T psi' + D; None if the coordinates are no such products."""
+    """xi = C psi + A q + c and J_xi = T psi' + D; None if the coordinates are not such products."""
     family = coordinates.family
     if not isinstance(family, ProductFamily):
         return None
-    # Products that the coordinates or their derivatives need, level by level.
+    # Find the products that the coordinates or their derivatives need, level by level.
     slopes = coordinates.scale[:, None, None] * family.derivative_tables(coordinates.theta).transpose(1, 0, 2)
     used = np.flatnonzero(slopes[:, :, 1:].any(axis=(0, 1)))
     plan = TermLevels.of(family.terms, [family.terms[k] for k in used])
     rows = {term: k for k, term in enumerate(family.terms)}
-    # The family may have no term for a function that its terms contain.
+    # The family may lack a term for a factor of its terms.
     if not set(plan.levels[0]) <= set(rows):
         return None
     q = ca.SX.sym("q", coordinates.space.n)
@@ -103,18 +103,18 @@ def _build_products(coordinates: Coordinates) -> Form | None:
 
 @dataclass(frozen=True)
 class TermLevels:
-    """Terms by number of factors. Each is a term of the level before times its last factor.
+    """Terms by number of factors. Each is a term of the previous level times its last factor.
 
     In every level, the terms that derivatives need come first.
     """
 
     levels: list[list[Term]]
-    lower: set[Term]  #: what derivatives need
+    lower: set[Term]  #: terms that derivatives need
 
     @classmethod
     def of(cls, terms: Iterable[Term], of_derivatives: Iterable[Term]) -> Self:
-        """The levels of these terms, with what they are made of."""
-        # Terms with all that they are products of; without derivatives, one term stands for the lower ones.
+        """The levels of these terms and of the shorter products that they contain."""
+        # A term is computed from its leading products, so collect these too.
         every, lower = with_parts(terms), with_parts(of_derivatives)
         every |= {_split_term(term)[1] for term in every}
         lower = lower or {min(term for term in every if np.count_nonzero(term) == 1)}
@@ -129,13 +129,13 @@ class TermLevels:
 
     @property
     def counts(self) -> dict[str, str]:
-        """How many terms each level has, and how many of them derivatives need, as Python."""
+        """Number of terms of each level, and number of those that derivatives need, as Python code."""
         lower = [sum(term in self.lower for term in level) for level in self.levels]
         return {"all": _write_tuple(map(len, self.levels)), "lower": _write_tuple(count for count in lower if count)}
 
     @property
     def indices(self) -> dict[str, list[int]]:
-        """For the terms of each level, rows of the level before and rows of one-joint functions."""
+        """For the terms of each level: rows of the previous level, and rows of one-joint functions."""
         result: dict[str, list[int]] = {}
         functions = {term: k for k, term in enumerate(self.levels[0])}
         for k, (before, level) in enumerate(pairwise(self.levels), start=1):
@@ -147,13 +147,13 @@ class TermLevels:
 
 
 def _split_term(term: Term) -> tuple[Term, Term]:
-    """A term without its last factor, and that factor alone."""
+    """A term without its last factor, and that factor as a term."""
     rest, joint, index = split(term)
     return rest, tuple(index if k == joint else 0 for k in range(len(term)))
 
 
 def _split_idle(coordinates: Coordinates) -> tuple[Array, Array]:
-    """A (r, n) and c (r, 1) with A q + c = q - centre for the idle joints, and 0 for the other coordinates."""
+    """A (r, n) and c (r, 1) with A q + c = q - centre for idle joints, and 0 for the other coordinates."""
     r, n, idle = coordinates.r, coordinates.space.n, list(coordinates.idle)
     A, c = np.zeros((r, n)), np.zeros((r, 1))
     A[r - len(idle) :] = np.eye(n)[idle]
@@ -166,11 +166,11 @@ def _write_tuple(values: Iterable[int]) -> str:
 
 
 def _build_network(coordinates: Coordinates) -> Form | None:
-    """xi = W_out a(... a(W_0 u + b_0) ...) + A q + c; None if the coordinates are no network."""
+    """xi = W_out a(... a(W_0 u + b_0) ...) + A q + c; None if the coordinates are not a network."""
     family = coordinates.family
     if not isinstance(family, MLPFamily):
         return None
-    # The last layer has the scale and offset of the coordinates; idle joints come beside it.
+    # Include scale and offset of the coordinates in the last layer; idle joints are added separately.
     scale, fitted, depth = coordinates.scale[:, None], len(coordinates.offset), len(family.hidden)
     weights, biases = split_layers(coordinates.theta, family.widths)
     active = np.array(coordinates.active, dtype=int)
@@ -180,7 +180,7 @@ def _build_network(coordinates: Coordinates) -> Form | None:
     W_out[:fitted] = scale * weights[depth].T
     c[:fitted] = scale * (biases[depth] - coordinates.offset)[:, None]
     turning, sliding = active[family.turning], active[family.direct]
-    # Joints that do not enter the network.
+    # Joints that are no inputs of the network.
     idle = np.setdiff1d(np.arange(coordinates.space.n), [*turning, *sliding])
     indices = {"turning": turning, "sliding": sliding, "idle": idle}
     indices["order"] = np.argsort(np.concatenate(list(indices.values())))
@@ -192,14 +192,14 @@ def _build_network(coordinates: Coordinates) -> Form | None:
 
 
 def write_statuses() -> str:
-    """Their numbers, as Python."""
+    """The numbers of the statuses as Python code."""
     return ", ".join(str(int(InverseStatus[name])) for name in STATUSES)
 
 
 def build_inverse_forms(chart: Chart) -> list[Form]:
     """The functions `_inverse` of columns phi and q_start (2 n, N), and `_nearest` of columns q_wish and x (n + m, N).
 
-    And what they call beside the functions of phi.
+    The list also has the functions that these call in addition to those of phi.
     """
     domain, rooms = chart.problem.domain, _count_rooms(chart.problem.domain)
     nearest = {
@@ -211,7 +211,7 @@ def build_inverse_forms(chart: Chart) -> list[Form]:
 
 
 def _build_newton(chart: Chart) -> Form:
-    """Newton's method, with errors and rates as `chart.solve` has them."""
+    """Newton's method with errors and rates as in `chart.solve`."""
     problem, n = chart.problem, chart.n
     domain, robot = problem.domain, problem.robot
     slack = _SLACK * domain.half_width
@@ -226,7 +226,7 @@ def _build_newton(chart: Chart) -> Form:
             dense_function("f", [ca.vertcat(target, value)], [difference]),
         )
     ]
-    # A whole orientation moves with the angular velocity, not with the derivative of its components.
+    # For a whole orientation, use the angular velocity instead of derivatives of its components.
     rates = "_task_and_slopes"
     if chart.parts.relative.turned:
         summary = "Task values, then how fast they move, angular velocities in the tip's axes, (m + m n, N)."
@@ -237,7 +237,7 @@ def _build_newton(chart: Chart) -> Form:
 
 
 def _count_rooms(domain: Domain) -> int:
-    """How many numbers are positive inside a domain, beside the bounds of joints."""
+    """Number of conditions of a domain in addition to its box."""
     if domain.singular_bound is not None:
         return 1 if domain.fold_bound is None else 2
     if domain.path_bound is not None:
@@ -246,9 +246,9 @@ def _count_rooms(domain: Domain) -> int:
 
 
 def _build_rooms(chart: Chart) -> list[Form]:
-    """The function `_room` of columns q (n, N) -> (rooms, N), for what a domain asks beside its box."""
+    """The function `_room` of columns q (n, N) -> (rooms, N): positive where the domain's conditions hold."""
     domain = chart.problem.domain
-    # Bounds on singular values, and on folds where there are any.
+    # Bounds on singular values and, if there are any, on folds.
     if (bound := domain.singular_bound) is not None:
         fold = domain.fold_bound
         summary = "Rows that must not be singular, one by one, (m n, N)."
@@ -256,7 +256,7 @@ def _build_rooms(chart: Chart) -> list[Form]:
         values = {"kind": "clear", "squared_bound": bound.least_singular_value**2, "folds": fold is not None}
         tables = {"row_scale": bound.scale[:, None], "unit": np.eye(chart.m)}
         return [Form("room", values, rows, tables, {}), *([] if fold is None else [_build_room_to_fold(chart, fold)])]
-    # The distance to the path of a corridor.
+    # Distance to the path of a corridor.
     if (path := domain.path_bound) is not None:
         starts, axes, squares = path.lines
         tables = {
@@ -266,7 +266,7 @@ def _build_rooms(chart: Chart) -> list[Form]:
             "path_lengths": np.sqrt(squares)[:, None],
         }
         return [Form("room", {"kind": "path"}, "", tables, {"path_joints": path.counted.tolist()})]
-    # Other conditions by their expression; boxes have none.
+    # Other conditions use their expression; boxes have none.
     if domain.condition is None:
         return [Form("room", {"kind": "box"}, "", {}, {})]
     summary = "Numbers (k, N) that are positive at columns q that meet the condition of the domain."
@@ -274,14 +274,14 @@ def _build_rooms(chart: Chart) -> list[Form]:
 
 
 def _build_room_to_fold(chart: Chart, fold: FoldBound) -> Form:
-    """The volume of the domain's coordinates, by the gradients of the chart where these are the same."""
+    """The volume of the domain's coordinates, from the chart's gradients if they agree."""
     # Gradients may differ by positive factors.
     points = sample_uniform(chart.problem.domain, _POINTS, 0)
     theirs = np.array([np.array(fold.gradients(q)) for q in points])
     own = chart.coordinates.jacobian(points)
     units = [rows / np.linalg.norm(rows, axis=2, keepdims=True) for rows in (theirs, own)]
     same = bool(np.abs(units[0] - units[1]).max() < _PARALLEL)
-    # Gradients that are those of the chart need no code of their own.
+    # If the gradients agree, no further code is needed.
     values = {
         "kind": "fold",
         "least_volume": fold.least_volume,
@@ -293,8 +293,8 @@ def _build_room_to_fold(chart: Chart, fold: FoldBound) -> Form:
 
 
 def write_function(name: str, summary: str, *functions: ca.Function) -> str:
-    """A Python function of columns q (n, N) with the entries of dense SX functions' outputs, row by row, (k, N)."""
-    # One tape for all functions, in which what they share is computed once.
+    """A Python function of columns q (n, N) that returns the entries of dense SX functions, row by row, (k, N)."""
+    # Use one tape for all functions, so that shared values are computed once.
     q = ca.SX.sym("q", functions[0].size_in(0)[0])
     rows = ca.vertcat(*(ca.vec(ca.densify(function(q)).T) for function in functions))
     lines = _write_tape(write_tape(ca.Function("rows", [q], [ca.cse(rows)])))
@@ -303,21 +303,21 @@ def write_function(name: str, summary: str, *functions: ca.Function) -> str:
 
 
 def _write_tape(tape: Tape) -> list[str]:
-    """The lines that compute a tape's output from columns q (n, N), and return it as (k, N)."""
+    """The code lines that compute a tape's output from columns q (n, N), and return it as (k, N)."""
     steps, lines = tape["steps"], list[str]()
-    # How many operands of later steps each step's result is.
+    # Count how often each result is an operand of later steps.
     uses, writer = [0] * len(steps), dict[int, int]()
     for k, (name, into, *of) in enumerate(steps):
         for slot in () if name in ("const", "input") else of:
             uses[writer[slot]] += 1
         if name != "output":
             writer[into] = k
-    # Constants in slots of the work array stay words; results of several uses are computed once.
+    # Constants are written inline; results with several uses get a variable.
     constants: dict[int, str] = {}
     results: dict[int, str] = {}
     for (name, into, *of), count in zip(steps, uses, strict=True):
         if name == "const":
-            # Exactly; in brackets where an operator beside it would take its sign.
+            # Write the number exactly, in brackets if it is negative.
             value = float(of[0])
             word = f'float("{value}")' if np.isinf(value) else repr(value)
             constants[into] = word if value >= 0 or np.isinf(value) else f"({word})"
@@ -342,7 +342,7 @@ _CONDITIONS = {
     "or": "({0} != 0) | ({1} != 0)",
 }
 
-# Names in NumPy, which PyTorch and JAX share.
+# Names of functions in NumPy, which PyTorch and JAX share.
 _FUNCTIONS = {
     name: name
     for name in (
@@ -362,7 +362,7 @@ _FUNCTIONS = {
 
 
 def _write_operation(name: str, of: list[Any], constants: dict[int, str]) -> str:
-    """One operation on work slots."""
+    """Code of one operation on work slots."""
     if name in _OPERATORS:
         return _OPERATORS[name].format(*(constants.get(slot, f"w{slot}") for slot in of))
     words = [_write_array(slot, constants) for slot in of]
@@ -374,5 +374,5 @@ def _write_operation(name: str, of: list[Any], constants: dict[int, str]) -> str
 
 
 def _write_array(slot: int, constants: dict[int, str]) -> str:
-    """The value in a work slot as an array, for functions that take nothing else."""
+    """The value in a work slot as an array, for functions that accept only arrays."""
     return f"np.full_like(q[0], {constants[slot]})" if slot in constants else f"w{slot}"

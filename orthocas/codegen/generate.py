@@ -38,7 +38,7 @@ from orthocas.tools.expressions import choose_form, expand_scalars
 from orthocas.tools.files import open_output_folder, publish, require_writable
 from orthocas.version import VERSION
 
-# Names of C headers and libraries, which no library of ours can have.
+# Names of C headers and libraries, which are not allowed for our libraries.
 _TAKEN = (
     *("assert", "complex", "ctype", "errno", "fenv", "float", "inttypes", "iso646", "limits", "locale", "math"),
     *("setjmp", "signal", "stdarg", "stdbool", "stddef", "stdint", "stdio", "stdlib", "string", "tgmath", "time"),
@@ -52,9 +52,10 @@ _TAKEN = (
 class LibraryRules:
     """Numbers of generated libraries."""
 
-    locals_bytes: int = 5120  #: of stack; 1 to 4.5 KiB with up to seven joints (tests/codegen/test_c_safety.py)
-    evaluations: int = 100  #: of the chart, at most, in one call of the inverse map
-    contact_margin: float = 0.02  #: that links keep under the supervised law [m]
+    #: stack for local variables [bytes]; 1 to 4.5 KiB with up to seven joints (tests/codegen/test_c_safety.py)
+    locals_bytes: int = 5120
+    evaluations: int = 100  #: largest number of evaluations of the chart in one call of the inverse map
+    contact_margin: float = 0.02  #: clearance between links under the supervised law [m]
 
 
 RULES = LibraryRules()
@@ -65,9 +66,9 @@ class GeneratedC:
     """The location and names of a generated library."""
 
     folder: Path
-    name: str  #: prefix of every C name, and of the files
+    name: str  #: prefix of every C name and of the files
     stack_bytes: int  #: largest stack use of a call
-    single_precision: bool = False  #: whether its numbers are `float`, not `double`
+    single_precision: bool = False  #: whether numbers are `float` instead of `double`
 
 
 def generate_c(
@@ -83,28 +84,28 @@ def generate_c(
     """Write C99 for a chart, the robot's dynamics, the inverse map, and a controller.
 
     NAME.c and NAME.h have a plain C interface, with a status for every call and outputs that are always finite.
-    CMakeLists.txt builds a static and a shared library, NAME.pc.in is for pkg-config, README.md describes the library.
-    The parameters of the chart are constants; state, reference and gains are arguments.
+    CMakeLists.txt builds a static and a shared library, NAME.pc.in is for pkg-config, and README.md describes the
+    library. The parameters of the chart are constants; state, reference and gains are arguments.
 
     Args:
         chart: a chart with a closed expression.
-        out: folder, created if its parent exists; replaces a library with the same name that was generated there.
-        controller: a controller of this chart, or one of its problem without a chart; default none.
-        name: a C identifier; default from the names of problem and controller.
+        out: output folder, created if its parent exists. A library of the same name that was generated there is
+            replaced.
+        controller: a controller of this chart, or one of its problem without a chart; default: none.
+        name: a C identifier; default: made from the names of problem and controller.
         force: also replace files of the same names that were not generated.
-        safety: settings of the supervised law; default `Safety.of(controller)`.
-        single_precision: whether numbers are `float` instead of `double`, for processors that compute in single
-            precision only.
-        capsules: of `oc.fit_capsules(robot.collisions)`: also write NAME_distance.c and NAME_distance.h with
-            NAME_distance, the least distance of the links and its gradient. With a torque law, the supervised law then
-            keeps 2 cm between them: contacts count as a part of its boundary.
+        safety: settings of the supervised law; default: `Safety.of(controller)`.
+        single_precision: whether numbers are `float` instead of `double`, for processors with single precision only.
+        capsules: result of `oc.fit_capsules(robot.collisions)`. Then NAME_distance.c and NAME_distance.h are written
+            too, with NAME_distance, which returns the least distance between links and its gradient. With a torque law,
+            the supervised law then keeps links 2 cm apart, and treats contacts as a part of its boundary.
 
     Raises:
-        NoExpressionError: if the chart is grown; `orthocas.distil` turns it into a chart with a closed expression.
+        NoExpressionError: if the chart is grown. `orthocas.distil` fits an expression to such a chart.
         InvalidValueError: if the name is not a C identifier, the controller belongs to another chart, or the
             folder has a file of the same name that was not generated.
         ArchiveError: if the folder is not writable, or a file there is a symbolic link.
-        CompileError: if this version of CasADi generates C of an unexpected form.
+        CompileError: if this version of CasADi generates C in an unexpected form.
 
     Example:
         >>> from tempfile import TemporaryDirectory
@@ -128,11 +129,11 @@ def generate_c(
         name = words if words[0].isalpha() else f"robot_{words}"
     require_name(name)
 
-    # CasADi writes the functions as kernels; templates put an interface around them.
+    # CasADi writes the functions as kernels; templates add the interface.
     precision = SINGLE if single_precision else DOUBLE
     kernels = generate_kernels(_build_functions(chart, controller, precision), f"{name}_kernel")
     stack_bytes = _bound_stack(kernels, chart, controller, precision.size)
-    # The supervised law asks for the distance of links within a tick.
+    # The supervised law calls the distance within a tick.
     if capsules is not None and controller is not None:
         stack_bytes += bound_distance_stack(capsules, precision.size)
     values = _describe_library(chart, controller, name, precision, kernels) | {"stack_bytes": stack_bytes}
@@ -151,7 +152,7 @@ def generate_c(
     if capsules is not None:
         contents |= render_distance(capsules, values, precision)
 
-    # All files are written or, if one fails, none.
+    # Write all files or, if one fails, none.
     folder = as_path("out", out)
     try:
         require_free_folder(folder, name, contents, force)
@@ -159,17 +160,17 @@ def generate_c(
             for file, text in contents.items():
                 (drafts / file).write_text(text, encoding="utf-8")
     except OSError as error:
-        # A name may be too long, for example.
+        # The name may be too long, for example.
         raise ArchiveError(f"cannot write to {out}: {error.strerror}") from error
     return GeneratedC(folder, name, stack_bytes, single_precision)
 
 
 def _check_law(chart: Chart, controller: Controller, safety: Safety | None) -> Safety:
-    """The settings of the supervised law; raise InvalidValueError for a law of another chart."""
+    """Return the settings of the supervised law; raise InvalidValueError for a law of another chart."""
     require_controller(controller)
     if (controller.chart or chart) is not chart or controller.problem is not chart.problem:
         raise InvalidValueError("controller", f"a {controller.name} of another chart", "a controller of this chart")
-    # Settings of the caller have the shapes of the default ones.
+    # Settings must have the same shapes as the default settings.
     default = Safety.of(controller)
     if safety is None:
         return default
@@ -180,7 +181,7 @@ def _check_law(chart: Chart, controller: Controller, safety: Safety | None) -> S
 
 
 def _build_functions(chart: Chart, controller: Controller | None, precision: Precision) -> list[ca.Function]:
-    """The kernels, with matrices row by row. One kernel computes mass matrix, bias and gravity, which share much."""
+    """The kernels, with matrices row by row. One kernel computes mass matrix, bias and gravity, which share code."""
     n, robot = chart.n, chart.problem.robot
     q, dq, v = (ca.MX.sym(name, n) for name in ("q", "dq", "v"))
     functions = [
@@ -195,11 +196,11 @@ def _build_functions(chart: Chart, controller: Controller | None, precision: Pre
     near = chart.parts.reaching
     functions.append(ca.Function("near", near.mx_in(), near.call(near.mx_in())))
     domain = find_condition(chart)
-    # A condition that asks for coordinates of a network stays a graph.
+    # A condition that contains network coordinates stays a graph.
     if domain is not None and domain.condition is not None:
         pivots = ca.Function("pivots", [q], [domain.condition.pivots(q)])
         functions.append(pivots if domain.condition.pivots.is_a("MXFunction") else expand_scalars(pivots))
-    # The law and its supervision share what they compute of the state alone.
+    # The law and its supervision share values that depend on the state only.
     if controller is not None:
         graph = precision.graph(controller)
         inputs = graph.mx_in()
@@ -209,9 +210,9 @@ def _build_functions(chart: Chart, controller: Controller | None, precision: Pre
 
 
 def _bound_stack(kernels: Kernels, chart: Chart, controller: Controller | None, size: int) -> int:
-    """Sum of the work arrays of kernels and runtime, and an allowance for other variables."""
+    """Upper bound of the stack: work arrays of kernels and runtime, plus an allowance for other variables."""
     n, rooms = chart.n, max(1, chart.parts.reaching.size1_out(2))
-    # Numbers of `work` in the runtime, as in orthocas_runtime.h, and copies of reference and gains.
+    # Size of `work` in the runtime (orthocas_runtime.h), and copies of reference and gains.
     system = 2 * n + rooms
     inverse, law = n * (n + 7), 0
     nearest = 4 * n * n + 14 * n + 4 * rooms + 3 * n * rooms + system * (system + 1)
@@ -232,8 +233,8 @@ def _bound_stack(kernels: Kernels, chart: Chart, controller: Controller | None, 
 def _describe_library(
     chart: Chart, controller: Controller | None, name: str, precision: Precision, kernels: Kernels
 ) -> dict[str, Any]:
-    """Values of the templates about names, versions, number type and kernels; no law yet."""
-    # The law comes later, from `describe_law`.
+    """Values of the templates about names, versions, number type and kernels, but not about the law."""
+    # `describe_law` adds the law later.
     what = "chart" if controller is None else f"{controller.name} controller"
     problem, label = chart.problem, chart.coordinates.label
     title = f"{what} of {problem.name}: {label}, task {problem.task.name}, metric {problem.metric.name}"
@@ -260,7 +261,7 @@ def _describe_chart(chart: Chart, precision: Precision) -> dict[str, Any]:
     names, units = clean_words(tree.joint_names), ["m" if sliding else "rad" for sliding in tree.prismatic]
     if (conditioned := find_condition(chart)) is not None and (part := conditioned.condition) is not None:
         condition = {"heading": clean_word(part.heading), "size": part.pivots.size1_out(0)}
-    # The boundaries, a line for each joint.
+    # The boundaries, one line per joint.
     low, high = domain.bounds
     domain_lines = ["all joint positions"]
     if np.isfinite(low).any():
@@ -328,9 +329,9 @@ def _write_row(values: Array) -> str:
 
 
 def _compute_check(chart: Chart, controller: Controller | None, precision: Precision) -> dict[str, Any]:
-    """A state, and what every function gives there, for `NAME_check`."""
+    """A state and the result of every function there, for `NAME_check`."""
     n, robot = chart.n, chart.problem.robot
-    # Between the home and a corner of the domain, or in the middle of the path of a corridor.
+    # Between the home and a corner of the domain, or in the middle of a corridor's path.
     domain = chart.problem.domain
     if (path := domain.path_bound) is not None:
         inside = path.postures[path.contains(path.postures)]
@@ -359,7 +360,7 @@ def _compute_check(chart: Chart, controller: Controller | None, precision: Preci
 
 
 def require_name(name: str) -> None:
-    """Raise InvalidValueError unless C allows a name, and no header or library of C has it."""
+    """Raise InvalidValueError unless C allows a name, and no C header or library has it."""
     is_identifier = isinstance(name, str) and re.fullmatch(r"[A-Za-z]\w{0,99}", name, flags=re.ASCII)
     if not is_identifier or name.lower() in _TAKEN:
         raise InvalidValueError(
@@ -368,21 +369,21 @@ def require_name(name: str) -> None:
 
 
 def require_free_folder(out: Path, name: str, files: Iterable[str], force: bool) -> None:
-    """Raise InvalidValueError if the folder holds files of the user that would be overwritten."""
+    """Raise InvalidValueError if the folder contains files of the user that would be overwritten."""
     if out.exists() and not out.is_dir():
         raise InvalidValueError("out", str(out), "a folder")
     require_writable(out / "README.md" if out.is_dir() else out, ArchiveError)
-    # Files that orthocas wrote are replaced, all others only by force.
+    # Files that orthocas wrote may be replaced, others only with `force`.
     for path in (out / file for file in files):
         if path.is_symlink():
-            raise ArchiveError(f"cannot write {path}: it is a symbolic link, expected a file or nothing")
+            raise ArchiveError(f"cannot write {path}: it is a symbolic link, expected a regular file or a new name")
         if path.exists() and not (force or is_generated(path)):
             raise InvalidValueError(
                 "out",
                 f"a folder with a {path.name} that orthocas did not write",
                 "another folder, or force (--force) to replace it",
             )
-    # The build file of another library is not replaced, either.
+    # The build file of another library must not be replaced either.
     build = out / "CMakeLists.txt"
     other = build.is_file() and f"project({name} " not in build.read_text(encoding="utf-8", errors="replace")
     if other and not force:

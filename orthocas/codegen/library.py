@@ -1,4 +1,4 @@
-"""Generated C as a compiled library, called from Python: functions, supervised law, and the time of a tick."""
+"""Generated C as a compiled library called from Python: functions, supervised law, and timing of ticks."""
 
 from __future__ import annotations
 
@@ -26,20 +26,20 @@ from orthocas.tools.interrupts import deferred
 from orthocas.tools.processes import run_program
 
 STRICT = ("-std=c99", "-Wall", "-Wextra", "-Wpedantic", "-Wconversion", "-Wshadow", "-Werror")
-NO_DOUBLE = ("-Wdouble-promotion", "-Wfloat-conversion")  #: for code in single precision
+NO_DOUBLE = ("-Wdouble-promotion", "-Wfloat-conversion")  #: compiler flags for code in single precision
 # As in runtime/ticks.c.
 _STATES = 64
-# To spend on one measurement.
+# Duration of one measurement.
 _MICROSECONDS = 3e5
 
 
 def compile_shared(
     generated: GeneratedC, folder: Path, flags: tuple[str, ...] = ("-O2",), compiler: str | None = None
 ) -> Path:
-    """Compile a shared library in a folder, with warnings as errors; default compiler: the first of `find_compilers`.
+    """Compile a shared library with warnings as errors; the default compiler is the first of `find_compilers`.
 
     Raises:
-        CompileError: if compilation fails; the message starts with the compiler's first lines.
+        CompileError: if compilation fails. The message starts with the compiler's first lines.
     """
     library = folder / f"lib{generated.name}.so"
     sources = [generated.folder / f"{generated.name}{end}.c" for end in ("", "_distance")]
@@ -62,7 +62,7 @@ def compile_shared(
 
 @dataclass(frozen=True, eq=False)
 class CompiledLibrary:
-    """The functions of a compiled library, with NumPy arrays and matrices (n, n)."""
+    """The functions of a compiled library for NumPy arrays and matrices (n, n)."""
 
     path: Path
     name: str
@@ -80,7 +80,7 @@ class CompiledLibrary:
         return phi, J, self._call("chart", [q], [phi, J])
 
     def check(self) -> float:
-        """Largest relative difference that the library finds between itself and the numbers it was generated with."""
+        """Largest relative difference between results of the library and the numbers stored when it was generated."""
         run = self.function("check")
         run.restype = self.precision.c_type
         return float(run())
@@ -91,7 +91,7 @@ class CompiledLibrary:
         return curvature, self._call("chart_curvature", [q, dq, v], [curvature])
 
     def inverse(self, phi: Array, q_start: Array, *, max_iterations: int = 100) -> tuple[Array, int]:
-        """q (n,), status; after at most so many evaluations of phi."""
+        """q (n,), status; at most `max_iterations` evaluations of phi."""
         q = self._zeros(self.n)
         return q, self._call("inverse", [phi, q_start], [q], int(max_iterations))
 
@@ -106,7 +106,7 @@ class CompiledLibrary:
         return M, bias, gravity, self._call("dynamics", [q, dq], [M, bias, gravity])
 
     def link_positions(self, motor_q: Array, stiffness: Array, torque: Array | None = None) -> tuple[Array, int]:
-        """q (n,) with stiffness (motor_q - q) = torque, which is gravity at q if it is not given, status."""
+        """q (n,) with stiffness (motor_q - q) = torque, and the status; default torque: gravity at q."""
         q, arrays = self._zeros(self.n), [motor_q, stiffness, *([] if torque is None else [torque])]
         for array in arrays:
             require_shape("an argument of link_positions", np.shape(array), (self.n,))
@@ -123,7 +123,7 @@ class CompiledLibrary:
     def spline(self, start: Array, target: Array, duration: float, time: float, last: Array | None = None) -> Array:
         """The reference (3 k,) at a time on the spline from a reference to rest at a target (k,).
 
-        Where that is not finite, C returns the value of the last reference (default 0), at rest.
+        If that is not finite, C returns the value of the last reference (default 0), at rest.
         """
         run, number = self.function("reference_spline"), self.precision.c_type
         run.argtypes, run.restype = [*[ctypes.c_void_p] * 2, number, number, ctypes.c_void_p], ctypes.c_int
@@ -169,9 +169,9 @@ class CompiledLibrary:
         return ctypes.CDLL(str(self.path))
 
     def _call(self, function: str, inputs: list[Array], outputs: list[Array], *numbers: Any) -> int:
-        """Call a function with arrays, then numbers, then the arrays that take its results; its status."""
+        """Call a function with input arrays, then numbers, then output arrays; returns its status."""
         arrays = [self.numbers(array) for array in inputs]
-        # C would read beyond the end of a short array; the first two have a number for each joint.
+        # C would read beyond the end of a short array. The first two arrays have one number per joint.
         for array in arrays[:2]:
             require_shape(f"an argument of {function}", array.shape[:1], (self.n,))
         places, results = ([array.ctypes.data_as(ctypes.c_void_p) for array in some] for some in (arrays, outputs))
@@ -184,19 +184,19 @@ def gain_numbers(controller: Controller) -> Array:
 
 
 class Supervisor:
-    """One supervised law: the state in C, and the functions that change it.
+    """One supervised law: its state in C, and the functions that change it.
 
     Args:
         library: a compiled library with this controller.
         controller: the law.
-        safety: other settings than those that the library was generated with.
+        safety: settings that replace those of the library.
     """
 
     def __init__(self, library: CompiledLibrary, controller: Controller, safety: Safety | None = None) -> None:
         require_kind("library", library, CompiledLibrary)
         require_controller(controller)
         self._n, self._k, self.library = library.n, len(controller.labels), library
-        # Functions of the supervised law; those that take numbers beside pointers state their types.
+        # Functions of the supervised law. Functions with number arguments declare their types.
         self._functions = {
             name: library.function(name)
             for name in ("check_start", "start", "take_over", "resume", "hold", "release", "step")
@@ -212,7 +212,7 @@ class Supervisor:
         self._functions |= {"stream": stream, "pace": pace}
         if safety is not None:
             require_kind("safety", safety, Safety)
-        # Settings as a struct, those of the library unless others are given.
+        # Settings as a struct: the given ones, or those of the library.
         values = (safety or Safety.of(controller)).in_c(controller.command)
         number = library.precision.c_type
         kinds = {name: ctypes.c_int if isinstance(value, int) else number for name, value in values.items()}
@@ -222,23 +222,25 @@ class Supervisor:
         if safety is not None:
             struct = settings(*(tuple(value) if isinstance(value, np.ndarray) else value for value in values.values()))
             self._safety = ctypes.pointer(struct)
-        # The state, with what the law remembers.
+        # The state, including the memory of the law.
         memory = find_memory(controller)
         fields = {} if memory is None else {name: number * len(value) for name, value in memory.start.items()}
         self._state = _build_state(self._n, self._k, number, settings, _build_struct("Memory", fields))()
         self._command = library.numbers(np.zeros(self._n))
-        self.gains = gain_numbers(controller)  #: numbers of the gains in the order of the C struct
+        self.gains = gain_numbers(controller)  #: the gains in the order of the C struct
 
     def check_start(self, q: ArrayLike, torque: ArrayLike) -> tuple[Array, ControlStatus]:
-        """Compare the torque that holds the arm with the model's, before `start`: torque - model (n,), and the status.
+        """Compare the torque that holds the arm with the model's, before `start`: torque - model (n,), status.
 
-        Nothing moves, and no state changes. The model's torque is the law's fallback at `gains`, gravity and their
-        payload without their limit; for velocity laws, gravity. LOAD_MISMATCH: a joint differs by more than
-        `Safety.start_mismatch`, so the mounting or the tool is another one. NOT_FINITE, with zeros: an input is.
+        Nothing moves, and no state changes. The model's torque is the law's fallback at `gains`: gravity with their
+        payload, but without their limit; for velocity laws, gravity. The status is LOAD_MISMATCH if a joint differs by
+        more than `Safety.start_mismatch`, so that the mounting or the tool must be different. It is NOT_FINITE, with
+        zeros, if an input is not finite.
 
         Args:
             q: joint positions (n,).
-            torque: measured or commanded, in terms of the command: without what the robot adds itself (n,).
+            torque: measured or commanded torque (n,), in the convention of the command: without what the robot adds
+                itself.
         """
         mismatch = self.library.numbers(np.zeros(self._n))
         inputs = [self._numbers(name, value, self._n) for name, value in (("q", q), ("torque", torque))]
@@ -247,7 +249,7 @@ class Supervisor:
         return mismatch, ControlStatus(status)
 
     def start(self, q: ArrayLike, command: ArrayLike | None = None) -> None:
-        """Begin at joint positions (n,), with the command (n,) that the robot executes now; default the fallback."""
+        """Start at joint positions (n,), with the command (n,) that the robot executes now; default: the fallback."""
         self._begin("start", q, command)
 
     def take_over(self, q: ArrayLike, command: ArrayLike) -> None:
@@ -256,15 +258,15 @@ class Supervisor:
         self._functions["take_over"](self._here, *map(pointer, points))
 
     def resume(self) -> None:
-        """Ask for the law again."""
+        """Request the law again."""
         self._functions["resume"](self._here)
 
     def hold(self, q: ArrayLike, command: ArrayLike | None = None) -> None:
-        """Brakes hold the arm at joint positions (n,); what the motors do now (n,), default the last command."""
+        """Report that brakes hold the arm at joint positions (n,), with a command (n,) (default: the last one)."""
         self._begin("hold", q, command)
 
     def release(self, q: ArrayLike, command: ArrayLike | None = None) -> None:
-        """Brakes open: the catcher holds the arm until `resume`."""
+        """Report that the brakes open. The catcher holds the arm until `resume`."""
         self._begin("release", q, command)
 
     def step(self, q: Array, dq: Array, reference: Array, period: float = 1e-3) -> tuple[Array, ControlStatus]:
@@ -274,7 +276,7 @@ class Supervisor:
             q: joint positions (n,).
             dq: joint velocities (n,).
             reference: [value, velocity, acceleration], (3 k,).
-            period: time since the last call [s].
+            period: time since the previous call [s].
         """
         inputs = [self._numbers(name, value, self._n) for name, value in (("q", q), ("dq", dq))]
         inputs += [self._reference(reference), self.library.numbers(self.gains)]
@@ -283,9 +285,10 @@ class Supervisor:
         return self._command.copy(), ControlStatus(status)
 
     def stream(self, reference: Array, target: ArrayLike, omega: float, period: float = 1e-3) -> ControlStatus:
-        """Move a reference by one tick towards a target (k,), with poles at omega [1/s]; the status.
+        """Move a reference by one tick towards a target (k,), with poles at omega [1/s]; returns the status.
 
-        OK, NEAR_BOUNDARY if the target lies beyond the boundary, so that the stream stops before it, or NOT_FINITE.
+        The status is OK, NEAR_BOUNDARY if the target is beyond the boundary, so that the stream stops before it, or
+        NOT_FINITE.
         """
         numbers = self._reference(reference)
         goal = self._numbers("target", target, self._k)
@@ -296,14 +299,14 @@ class Supervisor:
         return ControlStatus(status)
 
     def pace(self, reference: Array, period: float = 1e-3) -> float:
-        """Scale the derivatives of a reference to what joints can follow; the pace at which time goes on, 0 to 1."""
+        """Limit the derivatives of a reference to what joints can follow; returns the speed of its time, 0 to 1."""
         numbers = self._reference(reference)
         pace = float(self._functions["pace"](self._here, pointer(numbers), as_number("period", period)))
         reference[:] = numbers
         return pace
 
     def __getattr__(self, name: str) -> Any:
-        """The fields of the state in C: mode, cause, weight, anchor, ...; `memory` is a dictionary of arrays."""
+        """Fields of the C state: mode, cause, weight, anchor, ...; `memory` is a dictionary of arrays."""
         if name.startswith("_"):
             raise AttributeError(name)
         value = getattr(self._state, name)
@@ -319,7 +322,7 @@ class Supervisor:
         self._functions[name](self._here, pointer(point), None if given is None else pointer(given))
 
     def _numbers(self, name: str, values: ArrayLike, size: int) -> Array:
-        """Numbers of the library's type, which may be NaN or infinite."""
+        """Numbers of the library's type; they may be NaN or infinite."""
         array = as_float_array(name, values)
         # C would read beyond the end of a short array.
         require_shape(name, array.shape, (size,))
@@ -348,7 +351,7 @@ def _build_state(
     if has_spring:
         layout |= dict.fromkeys(("load", "drive", "speed"), joints) | {"inertia": number * n**2}
         layout |= dict.fromkeys(("expected", "unexplained", "momentum", "trend", "touch", "carried"), joints)
-    # Laws that remember have their fields before the last reference.
+    # The memory of a law precedes the last reference.
     if memory._fields_:
         layout["memory"] = memory
     layout |= dict.fromkeys(("value", "velocity", "acceleration"), quantities)
@@ -356,7 +359,7 @@ def _build_state(
 
 
 def _build_struct(name: str, layout: dict[str, Any]) -> type[ctypes.Structure]:
-    """A struct of C with these fields, in order."""
+    """A C struct with these fields, in order."""
     return type(name, (ctypes.Structure,), {"_fields_": list(layout.items())})
 
 
@@ -366,8 +369,8 @@ class Ticks:
 
     median: float
     p99: float
-    worst: float  #: includes interrupts and other activity of the machine
-    slowest_state: float  #: best time of the slowest of 64 states, which excludes other activity of the machine
+    worst: float  #: worst time, with interrupts and other activity of the machine
+    slowest_state: float  #: best time of the slowest of 64 states, without other activity of the machine
 
 
 def control_tick(chart: Chart) -> float:
@@ -388,7 +391,7 @@ def control_tick(chart: Chart) -> float:
 
 
 def time_ticks(cases: Sequence[tuple[Controller, CompiledLibrary]], calls: int = 100_000) -> list[Ticks]:
-    """Measure compiled controllers of one robot and number type, with their own gains, on 64 states inside the domain.
+    """Time compiled controllers of one robot and number type, with their own gains, on 64 states inside the domain.
 
     Raises:
         CompileError: if there is no C compiler, or the timing program cannot be built or run.
@@ -396,7 +399,7 @@ def time_ticks(cases: Sequence[tuple[Controller, CompiledLibrary]], calls: int =
     first = cases[0][1]
     with open_draft_folder() as folder:
         data, program = folder / "states", folder / "ticks"
-        # For each law its states, then its gains.
+        # For each law: its states, then its gains.
         parts = [part.ravel() for law, _ in cases for part in (_sample_states(law), gain_numbers(law))]
         first.numbers(np.concatenate(parts)).tofile(data)
         (folder / "ticks.c").write_text(get_source("ticks.c"))
@@ -413,7 +416,7 @@ def time_ticks(cases: Sequence[tuple[Controller, CompiledLibrary]], calls: int =
 def _sample_states(law: Controller) -> Array:
     """States inside the domain with references nearby, (64, 2 n + 3 k)."""
     rng, domain, n, k = np.random.default_rng(0), law.problem.domain, law.problem.n, len(law.labels)
-    # The inner part of a box may lie outside a condition: the home does not.
+    # A position near the centre of the box may violate a condition of the domain; the home never does.
     q = domain.centre + 0.4 * domain.half_width * rng.uniform(-1, 1, (_STATES, n))
     q[~domain.contains(q)] = domain.home
     reference = np.array([law.measured(point).full().ravel() for point in q]) + 0.01 * rng.normal(size=(_STATES, k))

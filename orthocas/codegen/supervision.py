@@ -1,4 +1,4 @@
-"""The supervised law in generated C: what its kernels compute, and what its templates are filled with."""
+"""The supervised law in generated C: its kernels, and the values of its templates."""
 
 from dataclasses import dataclass
 from typing import Any
@@ -23,31 +23,33 @@ from orthocas.tools.expressions import expand_scalars, wrap_shortest
 class SupervisionRules:
     """Numbers of the kernels of the supervised law."""
 
-    unit: float = 1.001  #: squared length of a quaternion, to rounding
-    damping: float = 1e-6  #: of least squares, for joint motions of fewer or more quantities than joints
-    samples: int = 256  #: of a domain, whose median room to a fold is the usual one
+    unit: float = 1.001  #: largest squared length of a unit quaternion with rounding
+    #: relative damping of least squares, for joint motions of fewer or more quantities than joints
+    damping: float = 1e-6
+    samples: int = 256  #: samples of a domain that determine its median distance to a fold
 
 
 RULES = SupervisionRules()
 
 
 def build_supervision_kernels(controller: Controller) -> list[ca.Function]:
-    """What the supervised law and its references compute besides the law itself.
+    """The kernels that the supervised law and its references need in addition to the law.
 
     - fallback(q, gains) -> command;
     - deviation(q, reference) -> quantities, reference - quantities;
-    - gap(reference with two derivatives, value) -> value - reference, rates of the reference as errors count;
-    - implied(q, dq, reference with two derivatives, change) -> A (n, n) row by row and B (n, 3), such that A^-1 B are
-      the change, velocity and acceleration of the joints that follow; dq is about that velocity;
-    - memory(q, dq, reference with two derivatives, gains, command, active, period, fields) -> fields, if it has one;
-    - gram(q) and room(q), how far q is from singular positions and from folds, if the domain is bounded by them.
+    - gap(reference with two derivatives, value) -> value - reference, and rates of the reference as rates of the error;
+    - implied(q, dq, reference with two derivatives, change) -> A (n, n) row by row and B (n, 3), such that A^-1 B is
+      the change, velocity and acceleration of joints that follow the reference, with dq near that velocity;
+    - memory(q, dq, reference with two derivatives, gains, command, active, period, fields) -> fields, if the law has
+      one;
+    - gram(q) and room(q), which measure the distance to singular positions and to folds, if they bound the domain.
     """
     n, m, k = controller.problem.n, controller.problem.m, len(controller.labels)
     fallback, q, reference = controller.fallback, ca.MX.sym("q", n), ca.MX.sym("reference", k)
     inputs = fallback.mx_in()
     measured, relative = controller.measured(q), Relative(controller.problem.task)
     start, velocity, acceleration, end = (ca.MX.sym(name, k) for name in ("start", "velocity", "acceleration", "end"))
-    # Errors and rates of the task by its own rules, all others as differences.
+    # The task has its own errors and rates; other quantities use differences.
     turned = relative.convert_rates(start[:m], velocity[:m], acceleration[:m])
     rates = [ca.vertcat(*parts) for parts in zip(turned, (velocity[m:], acceleration[m:]), strict=True)]
     deviation = [ca.densify(measured), _subtract(controller, relative, reference, measured)]
@@ -58,7 +60,7 @@ def build_supervision_kernels(controller: Controller) -> list[ca.Function]:
         ca.Function("gap", [start, velocity, acceleration, end], gap),
         _build_implied(controller, relative),
     ]
-    # Orientations turn instead of adding up, laws may remember, and domains may be bounded by singular positions.
+    # Additional kernels: for orientations, for laws with memory, and for domains with bounds.
     if relative.turned:
         kernels += [relative.moved, relative.turned_by]
     if (memory := find_memory(controller)) is not None:
@@ -73,7 +75,7 @@ def build_supervision_kernels(controller: Controller) -> list[ca.Function]:
 
 
 def _subtract(controller: Controller, relative: Relative, end: ca.MX, start: ca.MX) -> ca.MX:
-    """The difference of two values of the controlled quantities, (k, 1), by the shorter turns. NaN: end is no value."""
+    """Difference of two values of the controlled quantities, (k, 1), by shorter turns; NaN if `end` is invalid."""
     m = controller.problem.m
     difference = ca.vertcat(relative.difference(end[:m], start[:m]), end[m:] - start[m:])
     # Orientations differ by sines of half an angle.
@@ -86,13 +88,13 @@ def _subtract(controller: Controller, relative: Relative, end: ca.MX, start: ca.
 
 
 def _build_implied(controller: Controller, relative: Relative) -> ca.Function:
-    """A and B of the joint motions that a reference implies; of damped least squares where k is not n."""
+    """A and B of the joint motions that a reference implies, by damped least squares if k is not n."""
     n, m, k = controller.problem.n, controller.problem.m, len(controller.labels)
     names = ("value", "velocity", "acceleration", "change")
     q, dq = (ca.MX.sym(name, n) for name in ("q", "dq"))
     value, *rates, change = (ca.MX.sym(name, k) for name in names)
 
-    # J and dJ/dt dq of the quantities, orientations relative to the reference.
+    # J and dJ/dt dq of the quantities, with orientations relative to the reference.
     slope = relative.error(q, value[:m])[1]
     if controller.chart is not None and controller.labels == controller.chart.labels:
         own = controller.chart.coordinates.functions
@@ -102,7 +104,7 @@ def _build_implied(controller: Controller, relative: Relative) -> ca.Function:
         J, bias = ca.vertcat(slope, J_2), ca.jtimes(J_2 @ dq, q, dq)
     bias = ca.vertcat(controller.problem.task.rates_derivative_function(q, dq, dq), bias)
 
-    # Rates of the reference as errors count; with fewer or more quantities than joints, damped least squares.
+    # Rates of the reference as rates of the error; damped least squares if k is not n.
     turned = relative.convert_rates(value[:m], rates[0][:m], rates[1][:m])
     velocity, acceleration = (ca.vertcat(a, b[m:]) for a, b in zip(turned, rates, strict=True))
     B = ca.horzcat(change, velocity, acceleration - bias)
@@ -112,10 +114,10 @@ def _build_implied(controller: Controller, relative: Relative) -> ca.Function:
 
 
 def find_condition(chart: Chart) -> Domain | None:
-    """The domain of a chart, if it has a condition beside its box.
+    """The domain of a chart, if it has a condition in addition to its box; otherwise None.
 
     Raises:
-        DomainError: if that condition has no form in C.
+        DomainError: if C does not support this condition.
     """
     domain = chart.problem.domain
     domain.require_bounds("form in C")
@@ -123,9 +125,9 @@ def find_condition(chart: Chart) -> Domain | None:
 
 
 def describe_law(controller: Controller) -> dict[str, Any]:
-    """Values of the templates about the law: gains, what its command means, and how it counts turns of joints."""
+    """Values of the templates about the law: gains, kind of command, and joints whose turns are counted."""
     problem, torque = controller.problem, controller.command == "torque"
-    # Joints that turn without end have a period; some robots compensate gravity themselves.
+    # Endless joints have a period; some robots compensate gravity themselves.
     turns = np.zeros(problem.n)
     turns[list(problem.turning)] = 2 * np.pi
     if controller.settings.get("gravity") == "robot":
@@ -157,7 +159,7 @@ def describe_law(controller: Controller) -> dict[str, Any]:
 
 
 def describe_supervision(controller: Controller, safety: Safety) -> dict[str, Any]:
-    """Values that the templates need for the supervised law: settings, boundary, memory and orientations."""
+    """Values of the templates for the supervised law: settings, boundary, memory and orientations."""
     problem, robot, domain = controller.problem, controller.problem.robot, controller.problem.domain
     lower, upper = domain.bounds
     path, relative = domain.path_bound, Relative(problem.task)
@@ -167,7 +169,7 @@ def describe_supervision(controller: Controller, safety: Safety) -> dict[str, An
         "unused_settings": () if controller.command == "torque" else TORQUE_ONLY,
         "turning": np.isinf(robot.lower) & np.isinf(robot.upper) & ~np.array(robot.tree.prismatic),
         "bounded": np.isfinite(lower) & np.isfinite(upper) & (controller.chart is not None),
-        # A path of a corridor ends one radius before the boundary of its box, which may be many radii wide.
+        # The path of a corridor ends one radius before the boundary of its box, which may be many radii wide.
         "boundary_unit": domain.half_width if path is None else np.minimum(domain.half_width, path.radius),
         "boundary": _describe_boundary(controller),
         "turned_first": relative.first,
@@ -189,7 +191,7 @@ def _describe_setting(name: str, value: Any) -> dict[str, Any]:
 
 
 def _describe_boundary(controller: Controller) -> dict[str, Any] | None:
-    """The condition of the law's domain as a part of its boundary, if it has one."""
+    """The condition of the law's domain as a part of its boundary; None without a condition."""
     domain = None if controller.chart is None else find_condition(controller.chart)
     if domain is None:
         return None
@@ -211,24 +213,24 @@ def _describe_boundary(controller: Controller) -> dict[str, Any] | None:
     fold_span = None
     if (room := domain.room_to_fold) is not None:
         meaning += " So is\n * the bound on the volume of the coordinates, in shares of the median."
-        # Of a median position, because the centre may be near the bound.
+        # Use the median position, because the centre may be near the bound.
         fold_span = float(np.median(Batched(room)(sample_uniform(domain, RULES.samples, 0))[0]))
     return {
         "meaning": meaning,
         "path": None,
         "bound": bound.least_singular_value,
-        # Of the home: the centre itself may be singular.
+        # Use the home, because the centre may be singular.
         "span": float(bound.singular_values(domain.home)) - bound.least_singular_value,
         "fold_span": fold_span,
     }
 
 
 def _describe_memory(controller: Controller) -> dict[str, Any] | None:
-    """The fields that a law remembers, and the gains that they are added to."""
+    """The fields of a law's memory, and the gains that they are added to; None without memory."""
     memory = find_memory(controller)
     if memory is None:
         return None
-    # C keeps the fields one after the other.
+    # C stores the fields consecutively.
     first = dict(zip(memory.start, np.cumsum([0, *map(len, memory.start.values())]).tolist(), strict=False))
     return {
         "torque": memory.torque,

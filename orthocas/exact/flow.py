@@ -25,15 +25,15 @@ from orthocas.tools.columns import ColumnFunction, arrange_blocks, split_by_samp
 class FlowRules:
     """Numbers of the integration of many trajectories."""
 
-    stages: int = 12  #: of the method of Dormand and Prince
-    few: int = 64  #: trajectories up to which a block of columns does not pay off
+    stages: int = 12  #: stages of the method of Dormand and Prince
+    few: int = 64  #: up to this number of trajectories, a block of columns does not pay off
     first: float = 0.25  #: first step
-    smallest: float = 1e-9  #: step; where smaller ones are needed, the field is singular and the trajectory stops
-    shrink: float = 0.2  #: smallest factor from one step to the next
-    grow: float = 10.0  #: largest factor
-    safety: float = 0.9  #: factor on the step that the error estimate allows
-    looser: float = 100.0  #: factor on the tolerance of tangent vectors, which need fewer digits than points
-    inverse: float = 1e-12  #: tolerance of the flow back from the leaf
+    smallest: float = 1e-9  #: a trajectory stops if it needs a smaller step, because the field is singular there
+    shrink: float = 0.2  #: smallest ratio of one step to the previous one
+    grow: float = 10.0  #: largest ratio of one step to the previous one
+    safety: float = 0.9  #: factor on the step size that the error estimate allows
+    looser: float = 100.0  #: factor on the tolerance for tangent vectors, which may be less accurate than points
+    inverse: float = 1e-12  #: tolerance of the flow from the leaf to a target
 
 
 RULES = FlowRules()
@@ -54,21 +54,21 @@ class Moved:
     """End points of trajectories."""
 
     points: Array  #: (N, n); for SINGULAR, the last point before the singularity
-    status: NDArray[np.int_]  #: `Arrival` of each trajectory, (N,), int
+    status: NDArray[np.int_]  #: `Arrival` of each trajectory, (N,)
 
     @property
     def reached(self) -> NDArray[np.bool_]:
-        """Which trajectories reached the desired task value, (N,)."""
+        """Whether each trajectory reached the desired task value, (N,)."""
         return np.asarray(self.status == Arrival.REACHED)
 
 
 @dataclass(frozen=True, eq=False)
 class GrownCoordinates:
-    """xi(q) = xi0(q_hat), where the flow along the task gradients meets the base leaf in q_hat and xi0 charts the leaf.
+    """xi(q) = xi0(q_hat), where q_hat is the point of the base leaf that the flow from q reaches, and xi0 its chart.
 
-    J_xi = Dxi0(q_hat) dq_hat/dq, with the derivative of the flow from forward sensitivities. ([AS2023] Sec. 6 names the
-    missing Jacobian as a drawback of growing.) Values are NaN where the flow runs into a singularity or ends outside
-    the chart of the leaf; `pull` reports them.
+    The Jacobian is J_xi = Dxi0(q_hat) dq_hat/dq, with the derivative of the flow from forward sensitivities. ([AS2023]
+    Sec. 6 mentions the missing Jacobian as a drawback of growing.) Values are NaN where the flow meets a singularity or
+    ends outside the chart of the leaf; `pull` reports which of these happened.
     """
 
     problem: Problem = field(repr=False)
@@ -86,7 +86,7 @@ class GrownCoordinates:
 
     @property
     def size(self) -> int:
-        """Count of the numbers that describe the chart of the leaf."""
+        """Number of values that describe the chart of the leaf."""
         return sum(array.size for array in self.leaf.to_arrays().values())
 
     @property
@@ -118,19 +118,19 @@ class GrownCoordinates:
         return self._mask_unknown(moved, values, values.gradients @ derivative)
 
     def inverse(self, phi: Array, q_start: Array) -> Array:
-        """Joint positions with given task values and coordinates, (N, n), by the flow back from the leaf.
+        """Joint positions with given task values and coordinates, (N, n), by the flow from the leaf to the task values.
 
-        The start (N, n) selects the whole turns and, if a linear leaf has several sheets, the sheet. Rows without a
+        The start (N, n) selects the full turns and, if a linear leaf has several sheets, the sheet. Rows without a
         solution are NaN.
         """
         m, n = self.problem.m, self.problem.n
-        # The point of the leaf with these coordinates, then along the flow to the task values.
+        # Find the point of the leaf with these coordinates, then flow to the task values.
         start = self.flow.pull(q_start, self.leaf.level)
         on_leaf = self.leaf.points(phi[:, m:], np.where(start.reached[:, None], start.points, np.nan))
         rows = np.isfinite(on_leaf).all(axis=1)
         solutions, x = np.full((len(phi), n), np.nan), phi[rows, :m]
         moved = self.flow.move(on_leaf[rows], x - self.leaf.level, RULES.inverse)
-        # One more step removes the integration error, which matters if task values are large numbers.
+        # A second, short flow removes the integration error, which matters for large task values.
         left = x - self.problem.task.batched(moved.points)[0]
         corrected = self.flow.move(moved.points, left, RULES.inverse).points
         solutions[rows] = np.where(moved.reached[:, None], corrected, np.nan)
@@ -154,7 +154,7 @@ class GrownCoordinates:
         return TaskFlow(self.problem)
 
     def _evaluate_leaf(self, moved: Moved) -> LeafValues:
-        """The leaf's chart at end points; an arbitrary point replaces those of trajectories that did not arrive."""
+        """The leaf's chart at end points; for trajectories that did not arrive, at an arbitrary point instead."""
         return self.leaf.values(np.where(moved.reached[:, None], moved.points, self.problem.domain.home))
 
     @staticmethod
@@ -168,12 +168,12 @@ class GrownCoordinates:
 
 @dataclass(frozen=True, eq=False)
 class TaskFlow:
-    """The flow dq/ds = J_x^#A dx, s in [0, 1], which changes task values by exactly dx, A-orthogonally to the leaves.
+    """The flow dq/ds = J_x^#A dx, s in [0, 1]; it changes task values by exactly dx, and is A-orthogonal to the leaves.
 
     For m = 1 it is dq/ds = dx grad_A h / (dh(grad_A h)), the curve of [AS2023] eq. (23) with the task value as its
     parameter. It ends on the desired leaf without a stopping rule (ours,
-    docs/explanation/derivations_exact.md#growing). For m >= 2 it follows the straight line in task coordinates; other
-    paths end elsewhere unless the distribution is involutive.
+    docs/explanation/derivations_exact.md#growing). For m >= 2 it follows the straight line in task coordinates. Other
+    paths lead to other end points unless the distribution is involutive.
     """
 
     problem: Problem
@@ -190,22 +190,21 @@ class TaskFlow:
         return Moved(ends, np.where(arrived, Arrival.REACHED, Arrival.SINGULAR))
 
     def pull(self, points: Array, level: Array, tolerance: float = TOLERANCE) -> Moved:
-        """Pull points (N, n) to the leaf h(q) = level (m,)."""
+        """Move points (N, n) along the flow to the leaf h(q) = level (m,)."""
         return self.move(points, level - self.problem.task.batched(points)[0], tolerance)
 
     def pull_with_derivative(self, points: Array, level: Array) -> tuple[Moved, Array]:
-        """Do the same as `pull`, and return d q_hat / dq, (N, n, n), by forward sensitivities.
+        """Like `pull`, and return d q_hat / dq, (N, n, n), by forward sensitivities.
 
-        The flow maps leaves to leaves, so r vectors v that start tangent to the leaf of q stay tangent to leaves, with
-        dv/ds = (df/dq) v. The code stores each v as a direction and the logarithm of its length. Where flow lines
-        converge, lengths fall by many orders of magnitude, and rounding would destroy the directions of v itself. Since
-        q_hat is constant along the flow, the derivative is [v_1 ... v_r] Z^T A, where Z is an A-orthonormal basis of
-        ker J_x(q).
+        The flow maps leaves to leaves. So r vectors v that start tangent to the leaf of q stay tangent to leaves, with
+        dv/ds = (df/dq) v. Each v is stored as a direction and the logarithm of its length: where flow lines converge,
+        lengths decrease by many orders of magnitude, and rounding would destroy the directions. Since q_hat is constant
+        along the flow, the derivative is [v_1 ... v_r] Z^T A, where Z is an A-orthonormal basis of ker J_x(q).
         """
         n, r = self.problem.n, self.problem.r
         A = self.problem.metric.evaluate(points)
         inverse = np.asarray(np.linalg.inv(A), dtype=float)
-        # Tangent vectors start as an A-orthonormal basis of ker J_x.
+        # The initial tangent vectors are an A-orthonormal basis of ker J_x.
         samples = Samples(points, self.problem.task.evaluate_jacobian(points), inverse)
         Z = samples.null_basis
         lengths = np.linalg.norm(Z, axis=1)
@@ -213,7 +212,7 @@ class TaskFlow:
         starts = np.concatenate([points, directions, np.log(lengths)], axis=1)
         dx = level - self.problem.task.batched(points)[0]
         ends, arrived = self._with_tangents.find_end_points(starts, dx, TOLERANCE)
-        # Directions and logarithms of lengths make the vectors again.
+        # Recover the vectors from directions and logarithms of lengths.
         tangents = ends[:, n : n + r * n].reshape(-1, r, n) * np.exp(ends[:, n + r * n :])[:, :, None]
         moved = Moved(ends[:, :n], np.where(arrived, Arrival.REACHED, Arrival.SINGULAR))
         return moved, tangents.transpose(0, 2, 1) @ Z.transpose(0, 2, 1) @ A
@@ -237,13 +236,13 @@ class TaskFlow:
 
     @cached_property
     def _with_tangents(self) -> BatchedFlow:
-        """The flow with r tangent vectors, stored as directions u with |u| = 1 and logarithms of lengths."""
-        # The state: q, then r directions, then the logarithms of their lengths.
+        """The flow with r tangent vectors, each stored as a unit direction u and the logarithm of its length."""
+        # State: q, then r directions, then the logarithms of their lengths.
         n, m, r = self.problem.n, self.problem.m, self.problem.r
         y, dx = ca.SX.sym("y", n + r * (n + 1)), ca.SX.sym("dx", m)
         q, directions = y[:n], ca.reshape(y[n : n + r * n], n, r)
         dq = self.field(q, dx)
-        # Along the flow a vector changes by df/dq v: the part along itself stretches it, and the rest turns it.
+        # A vector changes by df/dq v. The component along v stretches it, and the rest turns it.
         turning = ca.jacobian(dq, q) @ directions
         stretching = ca.sum1(directions * turning) / ca.sum1(directions**2)
         rates = turning - directions * ca.repmat(stretching, n, 1)
@@ -271,9 +270,9 @@ class BatchedFlow:
     scale: Array
 
     def find_end_points(self, starts: Array, parameters: Array, tolerance: float) -> tuple[Array, NDArray[np.bool_]]:
-        """States at s = 1, (N, k), and which trajectories reached s = 1, (N,).
+        """States at s = 1, (N, k), and whether each trajectory reached s = 1, (N,).
 
-        The other trajectories stopped where steps became too short or the field was not finite. Their rows hold the
+        The other trajectories stopped because steps became too short or the field was not finite. Their rows hold the
         last state.
 
         Args:
@@ -284,7 +283,7 @@ class BatchedFlow:
         y, s, step = starts.copy(), np.zeros(len(starts)), np.full(len(starts), RULES.first)
         running = np.arange(len(starts))
         while running.size:
-            # Try a step of each running trajectory, of many in blocks of columns.
+            # Try a step of each running trajectory; many trajectories use blocks of columns.
             tried = np.minimum(step[running], 1 - s[running])
             inputs = y[running], tried[:, None], parameters[running]
             if running.size <= RULES.few:
@@ -292,7 +291,7 @@ class BatchedFlow:
             else:
                 outputs = self._many(*map(arrange_blocks, inputs))
                 moved, error = (split_by_sample(out[:, None], running.size)[:, :, 0] for out in outputs)
-            # Keep good steps, and adapt the sizes of all.
+            # Accept steps with small errors, and adapt all step sizes.
             ratio = np.nan_to_num(error[:, 0] / tolerance, nan=np.inf)
             good = ratio <= 1
             y[running[good]] = moved[good]
@@ -313,15 +312,14 @@ class BatchedFlow:
     @cached_property
     def _step(self) -> ca.Function:
         """One step: y, step size, p -> new y and its estimated error in units of the tolerance."""
-        # Slopes at the stages, each from those before, then the step and two estimates of its error.
-        # Stages of the method of Dormand and Prince of order 8, as SciPy has its coefficients.
+        # Slopes at the stages of the method (coefficients from SciPy), then the new state and two error estimates.
         k = self.field.size1_in(0)
         y, step, p = ca.SX.sym("y", k), ca.SX.sym("step"), ca.SX.sym("p", self.field.size1_in(1))
         method, slopes = scipy.integrate.DOP853, list[Any]()
         for i in range(RULES.stages):
             slopes.append(self.field(y + step * _sum_weighted(method.A[i, :i], slopes), p) if i else self.field(y, p))
         moved = y + step * _sum_weighted(method.B, slopes)
-        # Its error combines those of orders 5 and 3.
+        # Combine the error estimates of orders 5 and 3.
         scale = ca.DM(self.scale)
         fifth = ca.sumsqr(_sum_weighted(method.E5[: RULES.stages], slopes) / scale)
         third = ca.sumsqr(_sum_weighted(method.E3[: RULES.stages], slopes) / scale)
@@ -330,5 +328,5 @@ class BatchedFlow:
 
 
 def _sum_weighted(weights: Array, slopes: list[Any]) -> Any:
-    """Weighted sum, without the terms whose weight is zero."""
+    """Weighted sum without the terms of zero weight."""
     return sum(float(w) * slope for w, slope in zip(weights, slopes, strict=True) if w != 0)

@@ -1,4 +1,4 @@
-"""Involutivity: whether exact orthogonal coordinates exist for a task, and if not, how close one can get."""
+"""Involutivity: whether a task has exact orthogonal coordinates, and how large the leak is otherwise."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from orthocas.tools.json import collect_attributes
 
 @dataclass(frozen=True, slots=True)
 class InvolutivityRules:
-    """When a defect counts as zero, and when its estimate says nothing."""
+    """Thresholds of zero defects and of useful estimates."""
 
-    rounding: float = 1e-7  #: defect, relative to the terms that cancel in it, that counts as zero
-    straight: float = 1e-12  #: [rad] turn of the task gradients over the domain that counts as none
-    large: float = 20.0  #: [deg] expected leak beyond the first-order estimate
+    rounding: float = 1e-7  #: defects below this count as zero, relative to the terms that cancel in them
+    straight: float = 1e-12  #: [rad]; task gradients that turn less over the domain count as constant
+    large: float = 20.0  #: [deg]; above this, the expected leak is beyond the first-order estimate
 
 
 RULES = InvolutivityRules()
@@ -41,8 +41,8 @@ class Involutivity(Shown):
     max: float
     worst_point: tuple[float, ...]  #: the sampled joint position with the largest d [rad] or [m]
     expected_leak_deg: float  #: estimated root mean square leak of good coordinates; compare `Report.leak`
-    expected_angle_deg: float  #: the same per component of an A-orthonormal task basis: expected leak / sqrt(m)
-    exact: bool  #: whether d = 0 up to rounding at all samples: exact coordinates exist near regular points
+    expected_angle_deg: float  #: this leak per component of an A-orthonormal task basis: expected leak / sqrt(m)
+    exact: bool  #: whether d = 0 up to rounding at all samples, so that exact coordinates exist near regular points
     samples: int
     seed: int
     singular_samples: int  #: samples left out: relative singular value of J_x below NEAR_SINGULAR
@@ -63,7 +63,7 @@ class Involutivity(Shown):
         )
 
     def facts(self) -> dict[str, str]:
-        """The verdict and its numbers."""
+        """The verdict and the numbers behind it."""
         return {
             "involutivity": "exact coordinates exist" if self.exact else "no exact coordinates",
             "verdict": self.verdict,
@@ -81,15 +81,16 @@ class Involutivity(Shown):
 def involutivity(problem: Problem, samples: int = 2000, seed: int = 1) -> Involutivity:
     """Whether span{grad_A h_i} is involutive, which decides whether exact coordinates exist ([AS2023] Theorem 1).
 
-    The defect is d(q) = sqrt(sum_{a<b} |P [e_a, e_b]|_A^2) for an A-orthonormal basis e_1..e_m of the span and
-    P = I - J^#A J_x. It does not depend on the choice of task coordinates, and is 0 for m = 1. Its unit is the inverse
-    of a length in the metric: 1/rad for A = I and revolute joints, 1/(sqrt(kg) m) for A = M. A defect below 1e-7 of the
+    The defect is d(q) = sqrt(sum_{a<b} |P [e_a, e_b]|_A^2) for an A-orthonormal basis e_1..e_m of the span and P = I -
+    J^#A J_x. It does not depend on the choice of task coordinates, and is 0 for m = 1. Its unit is the inverse of a
+    length in the metric: 1/rad for A = I and revolute joints, 1/(sqrt(kg) m) for A = M. A defect below 1e-7 of the
     terms that cancel in it counts as zero.
 
-    The expected leak is d times the size of the domain along the span, without a fitted constant. To first order in
-    that size it is the root mean square leak of quadratic coordinates that `evaluate` reports, an angle in the metric.
-    The paper's task angles have Euclidean norms and can be several times smaller. Rich families come within a factor of
-    two (examples/involutivity.py). Exact coordinates exist only locally: none covers a closed self-motion manifold.
+    The expected leak is d times the size of the domain along the span; no constant is fitted. To first order in that
+    size, it is the root mean square leak of quadratic coordinates that `evaluate` reports, which is an angle in the
+    metric. The paper's task angles use Euclidean norms and can be several times smaller. Rich families come within a
+    factor of two of the estimate (examples/involutivity.py). Exact coordinates exist only locally: none covers a closed
+    self-motion manifold.
 
     Args:
         problem: robot, task, metric and domain.
@@ -115,13 +116,13 @@ def involutivity(problem: Problem, samples: int = 2000, seed: int = 1) -> Involu
     require_kind("problem", problem, Problem)
     require_driven("involutivity", problem.robot.tree)
     require_memory(f"{samples} samples of the defect", 32.0 * samples * problem.n * problem.m**2)
-    # Uniform samples of the domain, without the near-singular ones.
+    # Take uniform samples of the domain except the near-singular ones.
     check(problem, samples, seed)
     points = sample_uniform(problem.domain, samples, seed)
     points = points[is_regular(problem, points)]
     if not len(points):
         raise SingularTaskError(f"task '{problem.task.name}' is near-singular at all {samples} samples of the domain")
-    # Brackets across the span at all samples, and the scale of what cancels in them.
+    # Evaluate brackets across the span at all samples, and the scale of the terms that cancel in them.
     brackets = TaskBrackets.build(problem)
     across, size, basis = Batched(brackets.build_tensor_function())(points)
     T = across.reshape(-1, problem.n, problem.m, problem.m)
@@ -129,7 +130,7 @@ def involutivity(problem: Problem, samples: int = 2000, seed: int = 1) -> Involu
     if not np.isfinite(d).all():
         at = np.round(points[np.flatnonzero(~np.isfinite(d))[0]], 4).tolist()
         raise SingularTaskError(f"the second derivative of task '{problem.task.name}' is not finite at q = {at}")
-    # What the defect makes of the domain, as an angle.
+    # Convert the defect over the domain to an angle.
     turns = _compute_squared_turns(T, basis.reshape(-1, problem.n, problem.m), problem.domain.half_width)
     leak = float(np.degrees(np.sqrt(turns.mean() / problem.r)))
     worst = int(np.argmax(d))
@@ -179,25 +180,25 @@ class TaskBrackets:
     basis: ca.SX  #: columns e_1..e_m, (n, m)
     across: ca.SX  #: U T(e_a, e_b) with T(e_a, e_b) = P [e_a, e_b] in column a m + b, (n, m m)
     defect: ca.SX  #: d = sqrt(sum_{a<b} |T(e_a, e_b)|_A^2)
-    size: ca.SX  #: root sum of squares of the terms that cancel in the brackets: the scale of rounding in d
+    size: ca.SX  #: root sum of squares of the terms that cancel in the brackets, which sets the rounding error of d
 
     @classmethod
     def build(cls, problem: Problem) -> TaskBrackets:
-        """Build the expressions. They are NaN where J_x loses rank.
+        """Build the expressions, which are NaN where J_x loses rank.
 
         With A = U^T U and the QR factors U^-T J_x^T = O R, the basis is E = U^-1 O = G R^-1, G = A^-1 J_x^T. Brackets
         across the span depend only on the values of the fields, so R can be treated as constant: the derivative of e_b
         along e_a is that of G along e_a, times column b of R^-1. In these terms P v is (I - O O^T) U v.
         """
         q, m = ca.SX.sym("q", problem.n), problem.m
-        # Gradients G = A^-1 J^T and an orthonormal basis of their span, through U^-T J^T = O R.
+        # Gradients G = A^-1 J^T, and an orthonormal basis of their span from U^-T J^T = O R.
         J = problem.task.jacobian_function(q)
         U = ca.chol(ca.sparsify(problem.metric.function(q)))
         duals = ca.solve(U.T, J.T)
         gradients = ca.solve(U, duals)
         unit, R = ca.qr(duals)
         basis, weights = ca.solve(U, unit), ca.inv(R)
-        # Derivatives of the fields along each other, their brackets, and the parts across the span.
+        # Derivatives of the fields along each other, their brackets, and the components across the span.
         along = [U @ ca.jtimes(gradients, q, basis[:, a]) @ weights for a in range(m)]
         brackets = [along[a][:, b] - along[b][:, a] for a in range(m) for b in range(m)]
         across = ca.horzcat(*[v - unit @ (unit.T @ v) for v in brackets])

@@ -1,4 +1,4 @@
-"""Charts of the base leaf S0 = {h(q) = x0}: lines, closed curves and disks, and how they are read from files."""
+"""Charts of the base leaf S0 = {h(q) = x0}: linear, circle and disk leaves, and reading them from files."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
@@ -24,20 +24,20 @@ from orthocas.tools.interrupts import deferred
 class LeafRules:
     """Numbers of the charts of leaves."""
 
-    on_leaf: float = 1e-6  #: [rad] or [m] from the leaf, for points that lie on it
-    disk_steps: int = 30  #: Newton steps from a triangle to the leaf above it
+    on_leaf: float = 1e-6  #: largest distance of points that count as lying on the leaf [rad] or [m]
+    disk_steps: int = 30  #: Newton steps from a triangle to the leaf
     on_disk: float = 1e-12  #: [rad] or [m] accepted distance from the leaf
-    fewest_across: int = 5  #: cells along the shortest edge of a region
-    scale_samples: int = 1000  #: to measure the size of the gradient
-    stages: int = 8  #: intermediate points on the way to the coordinates of a linear leaf
+    fewest_across: int = 5  #: fewest cells along the shortest edge of a region
+    scale_samples: int = 1000  #: samples for measuring the size of the gradient
+    stages: int = 8  #: intermediate points on the path to the coordinates of a linear leaf
     iterations: int = 10  #: Newton steps at each of these points
-    solved: float = 1e-12  #: residual of a solution, scaled
-    on_curve: float = 1e-5  #: [rad] distance beyond which a point belongs to another component of the leaf
+    solved: float = 1e-12  #: scaled residual of a solution
+    on_curve: float = 1e-5  #: [rad]; a point farther from the curve belongs to another component of the leaf
     piece: float = 1.0  #: arc length per call of the integrator
-    steps: int = 100  #: number of outputs per call
-    longest: float = 200.0  #: [rad] longest curve
-    singular: float = 0.01  #: smallest singular value of J_x on the curve, relative to the largest
-    fewest: int = 20  #: samples of a curve
+    steps: int = 100  #: outputs per call of the integrator
+    longest: float = 200.0  #: [rad], longest curve that is traced
+    singular: float = 0.01  #: smallest singular value of J_x allowed on the curve, relative to the largest
+    fewest: int = 20  #: fewest samples of a curve
     closings: int = 3  #: corrections of the length of a curve
     projections: int = 4  #: Gauss-Newton steps from the nearest sample to the nearest point of the curve
 
@@ -55,22 +55,22 @@ class LeafValues:
 
     xi: Array  #: (N, r)
     gradients: Array  #: d xi0 / dq along the leaf, (N, r, n)
-    inside: NDArray[np.bool_]  #: which points the chart covers, (N,); the other rows are meaningless
+    inside: NDArray[np.bool_]  #: whether the chart covers each point, (N,); other rows are meaningless
 
 
 def find_turning_joints(problem: Problem) -> NDArray[np.bool_]:
-    """Which joint positions are angles, (n,)."""
+    """Whether each joint position is an angle, (n,)."""
     return ~np.array(problem.robot.tree.prismatic, dtype=np.bool_)
 
 
 def remove_turns(problem: Problem, differences: Array) -> Array:
-    """Differences of joint positions, (..., n), with angles within half a turn of 0."""
+    """Differences of joint positions, (..., n), with angles reduced to at most half a turn."""
     return np.asarray(wrap_shortest(differences, np.where(find_turning_joints(problem), 2 * np.pi, 0.0)))
 
 
 def require_on_leaf(problem: Problem, level: Array, points: Array) -> None:
     """Raise InvalidValueError unless points (N, n) lie on the leaf h(q) = level (m,), relative to the size of J_x."""
-    # In units of the size of the gradients, an error of the task is a distance.
+    # Dividing an error of the task by the size of the gradients gives a distance.
     J = problem.task.evaluate_jacobian(points)
     off = np.abs(problem.task.batched(points)[0] - level).max(axis=1)
     size = np.sqrt((J**2).sum(axis=(1, 2)).mean())
@@ -83,8 +83,8 @@ def require_on_leaf(problem: Problem, level: Array, points: Array) -> None:
 class DiskLeaf:
     """xi0(q), the harmonic map of a triangulated leaf onto the unit disk, linear on every triangle.
 
-    A point of the leaf gets the coordinates of the nearest point of the mesh. Between neighbouring triangles, the jump
-    of the gradient is of the order of the cell size, and the jump of the value is of the order of its third power.
+    A point of the leaf gets the coordinates of the nearest point of the mesh. Between neighbouring triangles, the
+    gradient jumps by an amount of the order of the cell size, and the value by the order of its third power.
     """
 
     problem: Problem = field(repr=False)
@@ -99,8 +99,7 @@ class DiskLeaf:
     periodic = True
 
     def __post_init__(self) -> None:
-        # Arrays may come from a file: check shapes and indices, and that points lie on disk and leaf.
-        # Arrays of the right shapes, copied and frozen.
+        # Arrays may come from a file, so check shapes and indices, and that points lie on disk and leaf.
         count = len(self.vertices)
         shapes: dict[str, tuple[int | None, ...]] = {
             "level": (1,),
@@ -112,7 +111,7 @@ class DiskLeaf:
         for name, shape in shapes.items():
             object.__setattr__(self, name, freeze_array(name, getattr(self, name), shape))
         object.__setattr__(self, "faces", freeze_indices("faces", self.faces, (None, 3), count))
-        # A mesh on the leaf, with an image in the disk.
+        # Check that the mesh is on the leaf, and its image in the disk.
         if not len(self.faces):
             raise InvalidValueError("faces", "empty", "at least one triangle")
         if np.linalg.norm(self.disk, axis=1).max() > 1 + 1e-9:
@@ -139,16 +138,16 @@ class DiskLeaf:
         return LeafValues(xi, self._gradients[located.face], np.asarray(inside))
 
     def points(self, xi: Array, near: Array | None = None) -> Array:
-        """Points of the leaf with coordinates xi (N, 2) in the disk; NaN for other xi.
+        """Points of the leaf with coordinates xi (N, 2) in the disk; NaN for xi outside.
 
-        Each point moves from its triangle along the triangle's normal onto the leaf, so that `values` returns xi.
+        Each point moves from its triangle along the normal onto the leaf, so that `values` returns xi.
         """
         inside = np.hypot(xi[:, 0], xi[:, 1]) <= 1
         located = self._in_disk.locate(np.where(inside[:, None], xi, 0.0))
         corners = self.faces[located.face]
         feet = np.einsum("sk,skn->sn", located.barycentric, self.vertices[corners])
         normals = self._normals[located.face]
-        # Newton along the normal of the triangle, for all points at once.
+        # Newton's method along the normals of the triangles, for all points at once.
         height = np.zeros((len(xi), 1))
         for _ in range(RULES.disk_steps):
             q = feet + height * normals
@@ -177,7 +176,7 @@ class DiskLeaf:
     def _edges(self) -> tuple[Array, Array]:
         """Two edges of every triangle in space, (F, 2, 3), and in the disk, (F, 2, 2)."""
         first, *others = (self.faces[:, k] for k in range(3))
-        # From the first corner to the two others.
+        # Edges from the first corner to the other two.
         in_space = np.stack([self.vertices[other] - self.vertices[first] for other in others], axis=1)
         in_disk = np.stack([self.disk[other] - self.disk[first] for other in others], axis=1)
         return in_space, in_disk
@@ -205,7 +204,7 @@ def build_disk_leaf(problem: Problem, level: Array, region: Box, cells: int = CE
 
     Raises:
         GrowError: if n is not 3, m is not 1, or the shortest edge of the region has too few cells.
-        NotADiskError: if that part of the leaf is not a disk; the message says what it is.
+        NotADiskError: if that part of the leaf is not a disk. The message says what it is.
     """
     if (problem.n, problem.m) != (3, 1):
         raise GrowError(
@@ -241,7 +240,7 @@ class LinearLeaf:
     """xi0(q) = N^T (q - q0) for q on the leaf of q0, as in [AS2023] eq. (21).
 
     It is a chart where the leaf is a graph over its tangent space at q0. Its values are defined everywhere on the leaf.
-    Where the leaf folds over, the Jacobian of the grown chart loses rank, which `evaluate` shows.
+    Where the leaf folds, the Jacobian of the grown chart loses rank, which `evaluate` reports.
     """
 
     problem: Problem = field(repr=False)
@@ -268,12 +267,12 @@ class LinearLeaf:
     def points(self, xi: Array, near: Array | None = None) -> Array:
         """Points of the leaf (N, n) with coordinates xi (N, r); NaN where no such point exists.
 
-        Newton's method follows the straight line from the coordinates of `near`, or of q0, to xi, and so stays on one
-        sheet.
+        Newton's method follows the straight line from the coordinates of `near`, or of q0, to xi, so that it stays on
+        one sheet.
         """
         q = np.broadcast_to(self.centre, (len(xi), len(self.centre)))
         q = q if near is None else np.where(np.isfinite(near), near, q)
-        # Follow the straight line to xi in steps, so that Newton stays on the sheet.
+        # Follow the straight line to xi in steps, so that Newton's method stays on the sheet.
         start = (q - self.centre) @ self.normals
         N = np.broadcast_to(self.normals.T, (len(xi), *self.normals.T.shape))
         for fraction in np.linspace(0.0, 1.0, RULES.stages + 1)[1:]:
@@ -312,7 +311,7 @@ def build_linear_leaf(problem: Problem, centre: Array) -> LinearLeaf:
 class CircleLeaf:
     """xi0 = 2 pi l / L in (-pi, pi] on a closed curve of length L, where l is the arc length from the first sample.
 
-    The cut is the point opposite the first sample, because a circle has no coordinate that is smooth everywhere.
+    At the point opposite the first sample, xi0 jumps from pi to -pi, because no coordinate is smooth on a whole circle.
     """
 
     problem: Problem = field(repr=False)
@@ -339,7 +338,7 @@ class CircleLeaf:
         """Coordinates of points on the leaf, (N, n)."""
         nearest = self._tree.query(self._embed(points))[1]
         L = self.length[0]
-        # From the nearest sample to the nearest point, by Gauss-Newton steps along the curve.
+        # Go from the nearest sample to the nearest point of the curve by Gauss-Newton steps.
         samples = self.curve[nearest]
         near = samples + remove_turns(self.problem, points - samples)
         along = nearest * L / (len(self.curve) - 1)
@@ -354,7 +353,7 @@ class CircleLeaf:
         return LeafValues(xi[:, None], gradients[:, None, :], inside)
 
     def points(self, xi: Array, near: Array | None = None) -> Array:
-        """Points of the leaf with coordinates xi (N, 1) in [-pi, pi]; both ends are at the cut. NaN for other xi."""
+        """Points of the leaf with coordinates xi (N, 1) in [-pi, pi]; both ends are one point. NaN for other xi."""
         along = xi[:, 0] * self.length[0] / (2 * np.pi)
         return np.where(np.abs(xi) <= np.pi + 1e-9, self._evaluate(along), np.nan)
 
@@ -364,12 +363,12 @@ class CircleLeaf:
 
     @cached_property
     def _drift(self) -> Array:
-        """Whole turns of the joints along the curve, (n,) [rad]."""
+        """Full turns of the joints along the curve, (n,) [rad]."""
         return np.asarray(self.curve[-1] - self.curve[0])
 
     @cached_property
     def _spline(self) -> Any:
-        """A spline of the curve without its drift, periodic in the arc length."""
+        """A spline of the curve minus its drift, periodic in the arc length."""
         fractions = np.linspace(0.0, 1.0, len(self.curve))[:, None]
         periodic = self.curve - fractions * self._drift
         periodic[-1] = periodic[0]
@@ -383,7 +382,7 @@ class CircleLeaf:
         return scipy.spatial.cKDTree(self._embed(self.curve[:-1]))
 
     def _embed(self, points: Array) -> Array:
-        """Angles as points on circles, so that whole turns do not matter."""
+        """Map angles to points on circles, so that full turns do not matter."""
         turning = find_turning_joints(self.problem)
         angles = points[:, turning]
         return np.concatenate([np.cos(angles), np.sin(angles), points[:, ~turning]], axis=1)
@@ -405,7 +404,7 @@ def trace_circle_leaf(problem: Problem, level: Array, start: Array) -> CircleLea
     while travelled < RULES.longest:
         piece = trace(q, RULES.piece)
         away = remove_turns(problem, piece[1:] - start)
-        # Arc length that is left to the start: the curve closes where it is near, and about to pass it.
+        # Arc length to the start. The curve closes where it is near the start and about to pass it.
         left = -(np.diff(piece, axis=0) * away).sum(axis=1) / step
         back = np.flatnonzero((np.linalg.norm(away, axis=1) < 2 * step) & (left >= 0))
         if back.size:
@@ -416,7 +415,7 @@ def trace_circle_leaf(problem: Problem, level: Array, start: Array) -> CircleLea
 
 
 def _close_circle(problem: Problem, level: Array, start: Array, length: float) -> CircleLeaf:
-    """Trace the leaf once around, with corrections of its length."""
+    """Trace the leaf once around, and correct its length."""
     trace = _build_tracer(problem, level, SAMPLES)
     for _ in range(RULES.closings):
         curve = trace(start, length)
@@ -424,7 +423,7 @@ def _close_circle(problem: Problem, level: Array, start: Array, length: float) -
         length -= float(last @ remove_turns(problem, curve[-1] - start)) / float(np.linalg.norm(last))
     curve = trace(start, length)
     sizes = np.linalg.svd(problem.task.evaluate_jacobian(curve), compute_uv=False)
-    # The integrator may step across a singular point.
+    # The integrator may step over a singular point.
     if sizes[:, -1].min() < RULES.singular * sizes[:, 0].max():
         _raise_singular(level)
     return CircleLeaf(problem, level, curve, np.array([length]))
@@ -437,10 +436,10 @@ def _raise_singular(level: Array) -> NoReturn:
 def _build_tracer(problem: Problem, level: Array, steps: int) -> Callable[[Array, float], Array]:
     """A map (point, length) -> points at equal arc lengths (steps + 1, n) along the leaf, integrated by SUNDIALS.
 
-    The curve follows the unit vector orthogonal to all task gradients; the term -J_x^# (h - x0) keeps it on the leaf.
+    The curve follows the unit vector orthogonal to all task gradients. The term -J_x^# (h - x0) keeps it on the leaf.
     """
     q, length = ca.SX.sym("q", problem.n), ca.SX.sym("length")
-    # The unit vector across all gradients, by cofactors, and a pull back to the leaf.
+    # Compute the unit vector by cofactors, and the correction towards the leaf.
     J = problem.task.jacobian_function(q)
     others = [[k for k in range(problem.n) if k != i] for i in range(problem.n)]
     across = ca.vertcat(*((-1) ** (i + 1) * compute_determinant(J[:, columns]) for i, columns in enumerate(others)))
@@ -453,7 +452,7 @@ def _build_tracer(problem: Problem, level: Array, steps: int) -> Callable[[Array
             "trace", "cvodes", {"x": q, "p": length, "ode": rate}, 0.0, grid[1:].tolist(), options
         )
 
-    # one leaf; the integrator fails where the gradients lose rank
+    # The integrator fails where the gradients lose rank.
     def trace(start: Array, span: float) -> Array:
         try:
             with deferred():
@@ -474,10 +473,10 @@ LEAVES: dict[str, type[LinearLeaf] | type[CircleLeaf] | type[DiskLeaf]] = {
 
 
 def read_leaf(problem: Problem, kind: str, arrays: Mapping[str, NDArray[Any]]) -> LeafChart:
-    """Build the chart of a leaf from its arrays.
+    """Rebuild the chart of a leaf from its arrays.
 
     Raises:
-        UnknownNameError: if no kind has that name.
+        UnknownNameError: if no kind of leaf has this name.
         ShapeError: if an array has the wrong shape.
     """
     require_known("leaf", kind, LEAVES)

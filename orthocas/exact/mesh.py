@@ -1,4 +1,4 @@
-"""Level surfaces of a task as triangle meshes, and harmonic maps of them ([AS2023] App. B)."""
+"""Level surfaces of a task as triangle meshes, and their harmonic maps ([AS2023] App. B)."""
 
 from __future__ import annotations
 
@@ -30,15 +30,16 @@ class MeshRules:
     """Numbers of meshes."""
 
     chunk: int = 10_000  #: points per call of libigl, which Ctrl-C cannot interrupt; 0.1 s on 200,000 triangles
-    rounds: int = 200  #: of flips; a few dozen suffice, but there is no proof that they end on a curved surface
-    flat: float = -1e-9  #: sum of the cotangents of the opposite angles below which an edge is flipped
+    #: largest number of rounds of flips; a few dozen suffice, but termination is not proved on curved surfaces
+    rounds: int = 200
+    flat: float = -1e-9  #: an edge is flipped if the cotangents of its opposite angles sum to less than this
 
 
 RULES = MeshRules()
 
 
 class _Libigl:
-    """libigl, of the extra `mesh`, which is imported on first use."""
+    """The package libigl of the extra `mesh`, imported on first use."""
 
     def __getattr__(self, name: str) -> Any:
         return getattr(import_extra("igl", "a chart on a surface", "mesh"), name)
@@ -53,7 +54,7 @@ class TriangleMesh:
 
     Args:
         vertices: (V, 3), finite.
-        faces: (F, 3) indices of vertices, counterclockwise seen from the side the normal points to.
+        faces: (F, 3) indices of vertices, counterclockwise as seen from the side of the normal.
 
     Raises:
         ShapeError: if an array has the wrong shape.
@@ -71,7 +72,7 @@ class TriangleMesh:
     @cached_property
     def edges(self) -> Indices:
         """Every edge once, (E, 2), the smaller index first."""
-        # Without triangles, libigl would run out of memory.
+        # libigl would run out of memory without triangles.
         if not len(self.faces):
             return np.empty((0, 2), dtype=np.int64)
         return np.asarray(igl.edges(self.faces))
@@ -85,7 +86,7 @@ class TriangleMesh:
     def clashing_edges(self) -> int:
         """Number of edges with three or more triangles, or with two triangles of opposite orientation.
 
-        Ours, because `igl.is_edge_manifold` misses the second case.
+        This is our own count, because `igl.is_edge_manifold` misses the second case.
         """
         start, end = list_half_edges(self.faces)
         keys, count = np.unique(start * len(self.vertices) + end, return_counts=True)
@@ -94,7 +95,7 @@ class TriangleMesh:
 
     @cached_property
     def components(self) -> int:
-        """Number of connected components; triangles are connected through edges, not through vertices."""
+        """Number of connected components. Triangles are connected through edges, not through vertices."""
         return int(igl.facet_components(self.faces)[0])
 
     @cached_property
@@ -114,14 +115,14 @@ class TriangleMesh:
 def require_disk(mesh: TriangleMesh) -> Indices:
     """Check that a mesh is a topological disk, and return its boundary.
 
-    A surface with at most two triangles at each edge is a disk if it has one component, one boundary loop and
-    V - E + F = 1. Two corners that touch in a vertex lower V - E + F.
+    A surface with at most two triangles at each edge is a disk if it has one component, one boundary loop and V - E + F
+    = 1. If two corners touch in one vertex, V - E + F is lower.
 
     Returns:
-        The boundary loop (B,), counterclockwise seen from the side of the normals, starting at the lowest index.
+        The boundary loop (B,), counterclockwise as seen from the side of the normals, starting at the lowest index.
 
     Raises:
-        NotADiskError: if the mesh is not a disk; the message says what it is.
+        NotADiskError: if the mesh is not a disk. The message says what it is.
 
     Source:
         Ours: docs/explanation/derivations_disk.md.
@@ -181,14 +182,14 @@ class TriangleLocator:
         areas = np.linalg.norm(_compute_normals(self._points[self._faces]), axis=1) / 2
         if not areas.min() > 0:
             raise InvalidValueError(f"area of triangle {areas.argmin()}", areas.min(), "a positive number")
-        # In a list, so that it can be cleared without the object.
+        # The list can be cleared without a reference to this object.
         self._trees = [igl.AABB()]
         self._trees[0].init(self._points, self._faces)
-        # Also at exit, where libigl would call a tree in use a leak.
+        # Clear the tree also at exit, where libigl would otherwise report a leak.
         finalize(self, self._trees.clear)
 
     def __reduce__(self) -> tuple[type[TriangleLocator], tuple[Array, Indices]]:
-        """Pickle and copy only the mesh; the tree is rebuilt."""
+        """Pickle and copy only the mesh; the copy rebuilds the tree."""
         return TriangleLocator, (self._vertices, self._faces)
 
     def locate(self, points: Array) -> Located:
@@ -205,7 +206,7 @@ class TriangleLocator:
         for start in starts:
             part = _pad_to_space(points[start : start + RULES.chunk])
             squares, face, closest = self._trees[0].squared_distance(self._points, self._faces, part)
-            # Where a distance is not finite, libigl has found no face.
+            # If a distance is not finite, libigl has found no face.
             require_finite("squared distance", squares)
             weights = _compute_barycentric(closest, self._points[self._faces[face]])
             parts.append(Located(face, weights, np.sqrt(squares)))
@@ -220,12 +221,12 @@ def _pad_to_space(points: Array) -> Array:
 def _compute_barycentric(points: Array, triangles: Array) -> Array:
     """Barycentric coordinates (N, 3) of points (N, 3) on triangles (N, 3, 3).
 
-    Ours, because those of libigl lose digits in flat triangles. For height 1e-4 and length 1, they reproduce the point
-    to 1e-8, and ours to 1e-13.
+    This is our own code, because libigl loses accuracy in flat triangles. For height 1e-4 and length 1, libigl's
+    coordinates reproduce the point to 1e-8, and ours to 1e-13.
     """
     normals = _compute_normals(triangles)
     to_corners = triangles - points[:, None]
-    # Of the triangles opposite corners 0, 1, 2.
+    # Areas of the triangles opposite corners 0, 1, 2.
     parts = np.cross(np.roll(to_corners, -1, axis=1), np.roll(to_corners, -2, axis=1))
     weights = np.maximum(np.einsum("ncd,nd->nc", parts, normals), 0.0)
     return np.asarray(weights / weights.sum(axis=1, keepdims=True))
@@ -242,7 +243,7 @@ def compute_cotangents(vertices: Array, faces: Indices) -> Array:
 
 
 def flip_to_delaunay(vertices: Array, faces: Indices) -> Indices:
-    """Flip edges until the angles opposite every inner edge add up to at most half a turn.
+    """Flip edges until the angles opposite every inner edge sum to at most half a turn.
 
     All weights cot(alpha) + cot(beta) are then >= 0. An edge is not flipped if the new edge already exists, or if a new
     triangle would face away from the old ones.
@@ -259,13 +260,14 @@ def flip_to_delaunay(vertices: Array, faces: Indices) -> Indices:
     """
     faces = faces.copy()
     for _ in range(RULES.rounds):
-        # Sorted keys of all edges, and the two half-edges of each inner edge: four times as fast as `igl.edge_flaps`.
+        # Sort the keys of all edges, and find the two half-edges of each inner edge; four times as fast as
+        # `igl.edge_flaps`.
         keys = number_edges(*list_half_edges(faces), len(vertices))
         order = np.argsort(keys, kind="stable")
         keys = keys[order]
         twin = np.flatnonzero(keys[1:] == keys[:-1])
         first, second = order[twin], order[twin + 1]
-        # Flip those whose opposite angles are too large, the worst first.
+        # Flip edges whose opposite angles are too large, the worst first.
         cot = np.nan_to_num(compute_cotangents(vertices, faces), nan=0.0, posinf=1e12, neginf=-1e12).T.ravel()
         weight = cot[first] + cot[second]
         flat = np.flatnonzero(weight < RULES.flat)
@@ -276,23 +278,23 @@ def flip_to_delaunay(vertices: Array, faces: Indices) -> Indices:
 
 
 def compute_smoothing_steps(points: Array, faces: Indices) -> Array:
-    """Smoothing steps (V, 3) from each vertex to the mean of its neighbours; every vertex must be in a triangle."""
+    """Smoothing steps (V, 3) from each vertex to the mean of its neighbours. Every vertex must be in a triangle."""
     neighbours = igl.adjacency_matrix(faces)
     mean = (neighbours @ points) / np.diff(neighbours.indptr)[:, None]
     return np.asarray(mean - points)
 
 
 def _flip(vertices: Array, faces: Indices, keys: Indices, first: Indices, second: Indices) -> bool:
-    """Flip edges in place, the worst first, and return whether any was flipped.
+    """Flip edges in place, the worst first; returns whether any edge was flipped.
 
-    An edge is flipped if the new one does not exist, and the new triangles face the same way as the old ones. Of flips
-    with a common triangle or new edge, the first is done.
+    An edge is flipped if the new edge does not exist yet, and the new triangles face the same way as the old ones. If
+    several flips share a triangle or a new edge, only the first is done.
     """
-    # Edges i -> j, with the opposite corners k in the first triangle and n in the second, as rows (N, 4).
+    # Edges i -> j with the opposite corners k in the first triangle and n in the second, as rows (N, 4).
     face, corner = first % len(faces), first // len(faces)
     i, j, k = (faces[face, (corner + shift) % 3] for shift in (1, 2, 0))
     quads = np.stack([i, j, k, faces[second % len(faces), second // len(faces)]], axis=1)
-    # The edge k - n is new, and the normals of i n k and n j k point as the sum of the old ones does.
+    # The new edge is k - n. The normals of i n k and n j k must point along the sum of the old normals.
     new = number_edges(quads[:, 2], quads[:, 3], len(vertices))
     place = np.minimum(np.searchsorted(keys, new), len(keys) - 1)
     p, q, r, s = (vertices[quads[:, c]] for c in range(4))
@@ -300,11 +302,11 @@ def _flip(vertices: Array, faces: Indices, keys: Indices, first: Indices, second
     one, two = (np.einsum("nd,nd->n", np.cross(a, b), normal) for a, b in ((s - p, r - p), (q - s, r - s)))
     allowed = (keys[place] != new) & (one > 0) & (two > 0)
     quads, face, other, new = quads[allowed], face[allowed], (second % len(faces))[allowed], new[allowed]
-    # The first at both of its triangles and at its new edge: `np.unique` names the first of equal ones.
+    # Keep flips that are the first at both triangles and at their new edge; `np.unique` returns first occurrences.
     _, at_face = np.unique(np.stack([face, other], axis=1), return_index=True)
     wins = np.bincount(at_face // 2, minlength=len(face)) == 2
     chosen = wins & np.isin(np.arange(len(face)), np.unique(new, return_index=True)[1])
-    # The edge k - n takes the place of i - j.
+    # Replace the edge i - j by k - n.
     i, j, k, n = quads[chosen].T
     faces[face[chosen]] = np.stack([i, n, k], axis=1)
     faces[other[chosen]] = np.stack([n, j, k], axis=1)
@@ -315,13 +317,13 @@ def _flip(vertices: Array, faces: Indices, keys: Indices, first: Indices, second
 class SurfaceRules:
     """Numbers of marching cubes and of the vertices on a surface."""
 
-    on_level: float = 2e-13  #: |h - level| of a vertex, relative to the larger of 1 and the largest |h|
-    rounds: int = 4  #: of flips and smoothing
-    newton_steps: int = 20  #: of a vertex to the surface
-    bisections: int = 60  #: of a grid edge, where Newton steps fail
-    #: smallest distance of marching cubes vertices from grid points, as a fraction of a cell's edge
+    on_level: float = 2e-13  #: |h - level| allowed at a vertex, relative to the larger of 1 and the largest |h|
+    rounds: int = 4  #: rounds of flips and smoothing
+    newton_steps: int = 20  #: Newton steps of a vertex to the surface
+    bisections: int = 60  #: bisections of a grid edge, where Newton's method fails
+    #: smallest distance of vertices from grid points in marching cubes, as a fraction of a cell's edge
     clearance: float = 0.1
-    tiny: float = 1e-300  #: to divide by
+    tiny: float = 1e-300  #: lower bound of divisors
     chunk: int = 500_000  #: grid points per call of h
 
 
@@ -337,24 +339,24 @@ def build_level_surface(
 ) -> TriangleMesh:
     """The surface {q : low <= q <= high, h(q) = level}.
 
-    Marching cubes finds the topology, Newton steps along the gradient move every vertex onto the surface, and edge
-    flips with tangential smoothing make the triangles round and Delaunay. Vertices on faces of the box stay there.
+    Marching cubes finds the topology. Newton steps along the gradient move every vertex onto the surface. Edge flips
+    with tangential smoothing make the triangles round and Delaunay. Vertices on faces of the box stay there.
 
     Args:
         h: function (N, 3) -> (N,).
         gradient: dh/dq, (N, 3) -> (N, 3).
-        level: the value of h on the surface.
+        level: value of h on the surface.
         low: (3,) lower corner of the box [rad] or [m].
         high: (3,) upper corner of the box, > low.
         cells: number of grid cells along the longest edge of the box, >= 2.
 
     Returns:
         A mesh with normals along the gradient and |h - level| <= 1e-12 at its vertices, relative to the largest |h| if
-        that exceeds 1. Components smaller than a cell may be missed.
+        that exceeds 1. It may miss components smaller than a cell.
 
     Raises:
         ShapeError: if low, high, or a value of h or its gradient has the wrong shape.
-        InvalidValueError: if h does not take the value in the box, is not finite, or jumps across the value.
+        InvalidValueError: if h does not take this value in the box, is not finite, or jumps across the value.
 
     Source:
         Marching cubes: [AS2023] Sec. 5.2. Exact vertices and the improvement of the triangles are ours:
@@ -364,12 +366,12 @@ def build_level_surface(
     corners = np.stack([freeze_array("low", low, (3,)), freeze_array("high", high, (3,))])
     if not np.all(corners[0] < corners[1]):
         raise InvalidValueError("low", corners[0].tolist(), f"less than high = {corners[1].tolist()}")
-    # A grid of nearly cubic cells, so many of them along the longest edge.
+    # Use a grid of nearly cubic cells, with the given number along the longest edge.
     width = corners[1] - corners[0]
     longest = require_count("cells", cells, least=2)
     counts = np.maximum(1, np.ceil(longest * width / width.max() - 1e-9)).astype(int) + 1
     axes = [np.linspace(corners[0, i], corners[1, i], counts[i]) for i in range(3)]
-    # Marching cubes, then Newton steps onto the surface, then flips and smoothing in turns.
+    # Marching cubes, then Newton steps onto the surface, then alternating flips and smoothing.
     gap, largest = _sample_gap(h, level, axes)
     points, faces, free, ends = _march_cubes(gap, axes)
     tolerance, cell = SURFACE.on_level * max(1.0, largest), float(axes[0][1] - axes[0][0])
@@ -383,14 +385,14 @@ def build_level_surface(
 
 @dataclass(frozen=True)
 class _Sheet:
-    """The surface and the box; vertices of the mesh move on both."""
+    """The surface and the box, on which the vertices of the mesh move."""
 
     h: Function
     gradient: Function
     level: float
     corners: Array  #: (2, 3)
-    free: Mask  #: (V, 3): whether a vertex may move along an axis; false across the faces of the box that it lies on
-    tolerance: float  #: of h
+    free: Mask  #: (V, 3): whether a vertex may move along an axis; false across a face of the box that contains it
+    tolerance: float  #: tolerance of h
     cell: float  #: edge length of a grid cell
 
     def start(self, points: Array, ends: Array) -> Array:
@@ -401,7 +403,7 @@ class _Sheet:
         return moved
 
     def slide(self, points: Array, steps: Array) -> Array:
-        """Move vertices by the part of their steps along surface and box; a vertex stays in place if Newton fails."""
+        """Move vertices by the part of their steps along surface and box; they stay in place if Newton fails."""
         normal = _evaluate_checked(self.gradient, points, "gradient", (3,)) * self.free
         normal /= np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), SURFACE.tiny)
         along = steps * self.free
@@ -410,14 +412,14 @@ class _Sheet:
         return moved
 
     def _take_newton_steps(self, start: Array) -> tuple[Array, Mask]:
-        """Take Newton steps along the free part of the gradient; return vertices that fail or move more than a cell."""
+        """Take Newton steps along the free part of the gradient; also returns vertices that fail or leave a cell."""
         points, moving = start.copy(), np.arange(len(start))
         for _ in range(SURFACE.newton_steps):
             gap = self._evaluate_gap(points[moving])
             moving, gap = moving[np.abs(gap) > self.tolerance], gap[np.abs(gap) > self.tolerance]
             if not len(moving):
                 break
-            # A Newton step along the free part of the gradient, at most a cell long.
+            # Newton step along the free part of the gradient, at most one cell long.
             slope = _evaluate_checked(self.gradient, points[moving], "gradient", (3,)) * self.free[moving]
             step = slope * (gap / np.maximum(np.sum(slope**2, axis=1), SURFACE.tiny))[:, None]
             length = np.linalg.norm(step, axis=1, keepdims=True)
@@ -429,29 +431,29 @@ class _Sheet:
 
     def _bisect(self, ends: Array) -> Array:
         """A point of the surface between each pair of ends (2, K, 3)."""
-        # Halves whose value has the sign of the first end move that end.
+        # The midpoint replaces the end at which h - level has the same sign.
         a, b = ends
         below = self._evaluate_gap(a) < 0
         for _ in range(SURFACE.bisections):
             centre = (a + b) / 2
             same = ((self._evaluate_gap(centre) < 0) == below)[:, None]
             a, b = np.where(same, centre, a), np.where(same, b, centre)
-        # Of the two ends, the one nearer to the level; where h jumps, neither is near.
+        # Take the end nearer to the level. If h jumps, neither end is near.
         points: Array = np.where((np.abs(self._evaluate_gap(a)) < np.abs(self._evaluate_gap(b)))[:, None], a, b)
         off = np.flatnonzero(np.abs(self._evaluate_gap(points)) > self.tolerance)
         if len(off):
             place = np.round(points[off[0]], 4).tolist()
-            raise InvalidValueError("level", self.level, f"a value that h does not jump across, as near {place}")
+            raise InvalidValueError("level", self.level, f"a value that h does not jump across; it does near {place}")
         return points
 
     def _evaluate_gap(self, points: Array) -> Array:
-        """Checked values of h - level."""
+        """h - level at points, checked to be finite."""
         return _evaluate_checked(self.h, points, "h", ()) - self.level
 
 
 def _sample_gap(h: Function, level: float, axes: list[Array]) -> tuple[NDArray[np.float32], float]:
-    """h - level on the grid in single precision with the signs preserved, and the largest |h|."""
-    # Slab by slab, since the grid does not fit into memory in double precision.
+    """h - level on the grid in single precision with the right signs, and the largest |h|."""
+    # Work in slabs, because the grid in double precision does not fit into memory.
     shape = tuple(len(axis) for axis in axes)
     gap = np.empty(shape, dtype=np.float32)
     slab = max(1, SURFACE.chunk // (shape[1] * shape[2]))
@@ -461,7 +463,7 @@ def _sample_gap(h: Function, level: float, axes: list[Array]) -> tuple[NDArray[n
         values = _evaluate_checked(h, grid.reshape(-1, 3), "h", ())
         lowest, highest = min(lowest, float(values.min())), max(highest, float(values.max()))
         gap[start : start + slab] = (values - level).reshape(grid.shape[:3])
-    # Without a value on both sides there is no surface.
+    # Without values on both sides there is no surface.
     if not lowest < level < highest:
         raise InvalidValueError("level", level, f"a value of h in the box, found {lowest:.6g} to {highest:.6g}")
     return gap, max(abs(lowest), abs(highest))
@@ -470,8 +472,9 @@ def _sample_gap(h: Function, level: float, axes: list[Array]) -> tuple[NDArray[n
 def _march_cubes(gap: NDArray[np.float32], axes: list[Array]) -> tuple[Array, Indices, Mask, Array]:
     """Marching cubes: vertices (V, 3), faces (F, 3), free axes (V, 3), and the ends of their grid edges (2, V, 3).
 
-    First the surface moves away from grid points, where triangles shrink to zero size. In place, |h - level| becomes at
-    least `clearance` times the largest change to a neighbour, along each axis and both ways. Zeros become positive.
+    Triangles would shrink to zero size near grid points, so the surface is first moved away from them. In place, |h -
+    level| is increased to at least `clearance` times the largest change to a neighbour, along each axis and in both
+    directions. Zeros become positive.
     """
     change = np.zeros_like(gap)
     for axis in range(3):
@@ -481,7 +484,7 @@ def _march_cubes(gap: NDArray[np.float32], axes: list[Array]) -> tuple[Array, In
             np.maximum(part, step, out=part)
     change *= SURFACE.clearance
     np.copyto(gap, np.where(gap < 0, -change, change), where=np.abs(gap) < change)
-    # Vertices lie on grid edges, between the grid points around them.
+    # Vertices lie on grid edges, between two neighbouring grid points.
     index, faces, _, _ = skimage.measure.marching_cubes(gap, 0.0, gradient_direction="descent")
     corners = np.stack([np.floor(index), np.ceil(index)]).astype(int)
     ends = np.stack([axis[corners[:, :, i]] for i, axis in enumerate(axes)], axis=2)
@@ -490,7 +493,7 @@ def _march_cubes(gap: NDArray[np.float32], axes: list[Array]) -> tuple[Array, In
 
 
 def _evaluate_checked(function: Function, points: Array, name: str, shape: tuple[int, ...]) -> Array:
-    """Checked values of h or its gradient."""
+    """Values of h or its gradient, with checked shape and finite entries."""
     values = np.asarray(function(points), dtype=float)
     require_shape(f"{name}(q)", values.shape, (len(points), *shape))
     require_finite(f"{name}(q)", values)
@@ -500,7 +503,7 @@ def _evaluate_checked(function: Function, points: Array, name: str, shape: tuple
 def map_to_disk(mesh: TriangleMesh) -> Array:
     """One-to-one harmonic map of a mesh onto the unit disk.
 
-    Boundary vertices lie on the unit circle, spaced by arc length; the one with the lowest index has angle 0. Every
+    Boundary vertices lie on the unit circle, spaced by arc length. The one with the lowest index has angle 0. Every
     inner vertex is the mean of its neighbours, weighted by cot(alpha) + cot(beta) with the angles opposite the edge. If
     no weight is negative (a Delaunay mesh), the map is one-to-one. The result is always checked for folds.
 

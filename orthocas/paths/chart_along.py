@@ -1,4 +1,4 @@
-"""One chart for a whole path of postures: the corridor around the path, and the chart that is fitted there."""
+"""One chart for a whole path of postures: the corridor around the path, and the chart fitted in it."""
 
 from __future__ import annotations
 
@@ -24,26 +24,26 @@ from orthocas.tools.checks import Array, as_number, as_point_set, require_kind
 class CorridorRules:
     """Numbers of charts along paths."""
 
-    degree: int = 3  #: of the polynomial, with an angle for each cyclic joint; more terms gain little there
-    spacing: float = 0.5  #: of the postures that are kept, in radii
-    prismatic: float = 0.25  #: length that counts like 1 rad [m]
-    samples: int = 200  #: that tell idle joints
+    degree: int = 3  #: degree of the polynomial, with an angle for each cyclic joint; higher degrees gain little there
+    spacing: float = 0.5  #: spacing of the postures that are kept, in radii
+    prismatic: float = 0.25  #: [m], displacement that counts like 1 rad
+    samples: int = 200  #: samples for finding idle joints
 
 
 RULES = CorridorRules()
 
 
 def chart_along(problem: Problem, postures: ArrayLike, radius: float = RADIUS) -> Chart:
-    """Fit one chart to the surroundings of a path of postures.
+    """Fit one chart to the neighbourhood of a path of postures.
 
-    The domain is the corridor of `corridor_problem`, the coordinates are polynomials of degree 3 with an angle for
-    each cyclic joint. One chart has one xi: with xi held, every closed path of the tool that can be shrunk to a point
-    in the corridor brings the posture back. Postures come from `follow` in a chart of less orthogonal coordinates, such
-    as a wide one, from a planner or from a log.
+    The domain is the corridor of `corridor_problem`. The coordinates are polynomials of degree 3 with an angle for each
+    cyclic joint. With constant xi, a closed path of the tool gives a closed path of the joints if that path can be
+    shrunk to a point in the corridor. The postures may come from `follow` in a less orthogonal chart, such as a wide
+    one, from a planner, or from a log.
 
     Args:
-        problem: robot, task and metric; its domain does not matter.
-        postures: the path in steps that are small against the radius, (N, n) [rad] or [m].
+        problem: robot, task and metric; its domain is ignored.
+        postures: the path with steps small compared to the radius, (N, n) [rad] or [m].
         radius: largest distance from the path [rad]; see `corridor_problem`.
 
     Raises:
@@ -67,19 +67,19 @@ def chart_along(problem: Problem, postures: ArrayLike, radius: float = RADIUS) -
 
 
 def corridor_problem(problem: Problem, postures: ArrayLike, radius: float = RADIUS, margin_deg: float = 0.0) -> Problem:
-    """The same robot, task and metric near a path of postures: a problem whose domain is a `Corridor`.
+    """The same robot, task and metric on a `Corridor` around a path of postures.
 
-    Fit it with `Polynomial(3, "auto")`. Joints that the task does not see, and joints that only turn the whole task,
-    may take all positions between their limits. The others, taken together, stay within the radius of the path.
+    Fit it with `Polynomial(3, "auto")`. Joints that do not move the task, and joints that only turn the whole task, may
+    take all positions between their limits. The others must stay, taken together, within the radius of the path.
 
     Args:
-        problem: robot, task and metric; its domain does not matter.
-        postures: the path in steps that are small against the radius, (N, n) [rad] or [m].
-        radius: largest distance from the path [rad]; prismatic joints count as if a quarter of it [m] were as much.
-        margin_deg: distance to the joint limits [deg].
+        problem: robot, task and metric; its domain is ignored.
+        postures: the path with steps small compared to the radius, (N, n) [rad] or [m].
+        radius: largest distance from the path [rad]; 0.25 m of a prismatic joint count like 1 rad.
+        margin_deg: margin to the joint limits [deg].
 
     Raises:
-        ShapeError, InvalidValueError, DomainError: if the postures have another shape, or none is within the limits.
+        ShapeError, InvalidValueError, DomainError: if the postures have a wrong shape, or none is within the limits.
 
     Example:
         >>> import numpy as np
@@ -100,19 +100,19 @@ def corridor_problem(problem: Problem, postures: ArrayLike, radius: float = RADI
     prismatic = np.array(problem.robot.tree.prismatic)
     sizes = np.where(prismatic, RULES.prismatic * size, size)
     whole = find_joint_range(problem.robot, margin_deg)
-    # Postures that are far enough apart, and the last one.
+    # Keep postures that are far enough apart, and the last one.
     scaled, kept = path / sizes, [0]
     for k in range(1, len(path)):
         if np.linalg.norm(scaled[k] - scaled[kept[-1]]) >= RULES.spacing or k == len(path) - 1:
             kept.append(k)
     path = path[kept]
 
-    # Which joints only turn the whole task, or do not move it, is asked in the narrow corridor.
+    # Find idle and cyclic joints in the narrow corridor.
     narrow = Problem(problem.robot, problem.task, problem.metric, _build_corridor(whole, path, sizes), problem.name)
     names = problem.robot.joint_names
     cyclic = cyclic_joints(narrow)
     idle = find_idle_joints(narrow, sample_problem(narrow, RULES.samples, 0))
-    # These may take their whole range.
+    # These joints may take their whole range.
     for k in {*idle, *map(names.index, cyclic)}:
         sizes[k] = np.inf
     free = Problem(problem.robot, problem.task, problem.metric, _build_corridor(whole, path, sizes), problem.name)
@@ -120,7 +120,7 @@ def corridor_problem(problem: Problem, postures: ArrayLike, radius: float = RADI
 
 
 def _build_corridor(whole: Box, path: Array, sizes: Array) -> Corridor:
-    """The corridor in its bounding box; joints with an infinite size have their whole range."""
+    """The corridor in its bounding box, with the whole range for joints of infinite size."""
     low = np.maximum(path.min(axis=0) - sizes, whole.centre - whole.half_width)
     high = np.minimum(path.max(axis=0) + sizes, whole.centre + whole.half_width)
     empty = np.flatnonzero(low >= high)

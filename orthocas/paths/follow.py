@@ -1,4 +1,4 @@
-"""From a tool path to a motion of the joints."""
+"""`follow`: a joint motion along a tool path."""
 
 from __future__ import annotations
 
@@ -41,34 +41,35 @@ def follow(
     clearance: float = 0.0,
     collisions: Collisions | None = None,
 ) -> JointMotion:
-    """Move the tool along a path: joint positions, velocities and accelerations on time stamps, from rest to rest.
+    """Move the tool along a path, from rest to rest: joint positions, velocities and accelerations on time stamps.
 
     The path is a cubic spline through the waypoints, periodic if it ends where it begins. At every time stamp, q has
-    the x and xi of the splines to 1e-10. The speed along the path is the fastest smooth profile that keeps the
-    limits of velocity and acceleration in 300 parts of the path; then time is stretched until 2,000 instants
-    and all time stamps keep them.
+    the x and xi of the splines to 1e-10. The speed along the path is the fastest smooth profile within the limits of
+    velocity and acceleration, checked in 300 parts of the path. Then time is stretched until the limits hold at 2,000
+    instants and at all time stamps.
 
     Args:
         chart: a fitted chart.
-        tool_path: waypoints, or a function of s in [0, 1] that returns one: task values (N, m) and (m,), or poses as
-            `Task.target` takes them.
+        tool_path: waypoints, or a function of s in [0, 1] that returns one waypoint: task values (N, m) or (m,), or
+            poses in a form that `Task.target` accepts.
         xi: "hold" keeps the coordinates of `q_start`. An array (N, r) gives them at the waypoints, a function of s in
-            [0, 1] along the path. "objective" chooses them: away from the boundary of the domain, from positions where
-            the task is near-singular, and from contacts, and with little motion; where a contact stops what a descent
-            finds, and r = 1, all xi along the path are searched. Circle-valued coordinates go from
-            each waypoint to the next by the shorter way, and count on beyond pi.
+            [0, 1] along the path. "objective" chooses them so that the arm stays away from the boundary of the domain,
+            from near-singular positions and from contacts, and moves little. If the result of the descent has a contact
+            and r = 1, all xi along the path are searched. Circle-valued coordinates take the shorter way between
+            waypoints, and count on beyond pi.
         q_start: a joint position (n,) near the start of the path. Default: the centre of the domain.
-        period: distance of the time stamps [s].
-        velocity_limits: (n,) or one number [rad/s] or [m/s]. Default: those of the robot's file.
+        period: interval between time stamps [s].
+        velocity_limits: (n,) or one number [rad/s] or [m/s]. Default: the limits in the robot's file.
         acceleration_limits: (n,) or one number [rad/s^2] or [m/s^2]. Default: full speed within 0.5 s.
-        clearance: smallest distance of the pairs of `collisions` [m].
-        collisions: of the chart's robot, such as `robot.collisions.with_scene(scene)`: no pair may come nearer than
-            the clearance, at the time stamps and between them. Robots without solids get rods: `Robot.with_rods`.
+        clearance: smallest allowed distance of the pairs of `collisions` [m].
+        collisions: collision model of the chart's robot, such as `robot.collisions.with_scene(scene)`. No pair may come
+            nearer than the clearance, at the time stamps and between them. For robots without solids, use rods:
+            `Robot.with_rods`.
 
     Raises:
         PathError: if the path leaves the reach or the domain, or a pair of `collisions` may come nearer than the
-            clearance; then the message names the pair and the time. The message names the waypoint, what stops the
-            motion there, and how far the coordinates reach before it.
+            clearance. The message names the waypoint, what stops the motion there, and the range of the coordinates
+            before it. For contacts, it names the pair and the time.
         InvalidValueError, ShapeError: for arguments of the wrong value or shape.
         NoExpressionError: for grown charts.
 
@@ -89,11 +90,11 @@ def follow(
     """
     require_kind("chart", chart, Chart)
     require_driven("following a path", chart.problem.robot.tree)
-    # Raises for grown charts.
+    # Refuse grown charts.
     chart.function("second_derivative")
     require_collisions(collisions, chart.problem.robot.tree)
     start = chart.problem.domain.home if q_start is None else as_point("q_start", q_start, chart.n)
-    # limits of all joints, > 0 and finite
+    # Limits of all joints must be finite and > 0.
     most = chart.problem.robot.velocity_limits if velocity_limits is None else velocity_limits
     speeds = _spread_limits(chart, "velocity_limits", most)
     accelerations = speeds / RULES.to_full_speed if acceleration_limits is None else acceleration_limits
@@ -105,7 +106,7 @@ def follow(
     if not 1e-5 <= stamp <= 10:
         raise InvalidValueError("period", period, "a time from 1e-5 to 10 s")
 
-    # phi(s) of the tool path, and q(s) with phi(q(s)) = phi(s).
+    # Choose phi(s), and trace q(s) with phi(q(s)) = phi(s).
     if not isinstance(xi, str):
         path = ToolPath.schedule(chart, tool_path, xi)
     elif xi in (HOLD, OBJECTIVE):
@@ -115,7 +116,7 @@ def follow(
     solver = PhiSolver(chart)
     if not (isinstance(xi, str) and xi == OBJECTIVE):
         return _move(path, JointCurve.trace(solver, path.phi, start), limits, stamp)
-    # The first choice of xi that can be followed, or why the first one cannot.
+    # Use the first choice of xi that can be followed; otherwise raise the error of the first choice.
     first: PathError | None = None
     for chosen, q in _choose_xi(path, solver, limits, start):
         try:
@@ -129,10 +130,10 @@ def follow(
 def _choose_xi(
     path: ToolPath, solver: PhiSolver, limits: MotionLimits, start: Array
 ) -> Iterator[tuple[ToolPath, Array]]:
-    """Tool paths with chosen coordinates, each with a start (n,): by descent, then from a search of all xi."""
+    """Tool paths with chosen coordinates, each with a start (n,): first by descent, then by a search of all xi."""
     chart, costs = solver.chart, Costs(limits)
     choice = XiChoice(path, costs, solver)
-    # From coordinates that are held, or from a walk where that is not possible.
+    # Start from constant coordinates, or from a walk if these cannot be followed.
     curve = JointCurve.trace(solver, path.phi, start)
     q = walk(chart, costs, path.x(choice.s), start) if isinstance(curve, LostCurve) else curve.q(choice.s)
     yield choice.optimise(q), q[0]
@@ -149,22 +150,23 @@ def _choose_xi(
         xi = counted_on(chart.xi(q), chart.parts.turns[chart.m :])
         if path.closed:
             xi[-1] = xi[0]
-        # Straight between the stations, as the search has checked: a spline through these alone swings out.
+        # Interpolate linearly between stations, as the search has checked; a spline through the stations alone would
+        # overshoot.
         places = np.linspace(0.0, 1.0, (len(s) - 1) * (RULES.station_places + 1) + 1)
         straight = np.column_stack([np.interp(places, s, column) for column in xi.T])
         yield path.replace_xi(build_spline(places, straight, path.closed)), q[0]
 
 
 def _move(path: ToolPath, curve: JointCurve | LostCurve, limits: MotionLimits, period: float) -> JointMotion:
-    """The motion along a curve, from rest to rest, if it can be followed."""
-    # Where it ends early or leaves the domain, an error says why.
+    """The motion along a joint curve, from rest to rest; raises PathError if it cannot be followed."""
+    # A curve that ends early or leaves the domain gives an error with the reason.
     if isinstance(curve, LostCurve):
         limits.check_kept(path, curve.s, curve.q)
         raise limits.build_lost_error(path, curve)
     s = path.list_checks()
     limits.check_kept(path, s, curve.q(s))
 
-    # The fastest s(t), then time stamps, slower until they keep the limits.
+    # Compute the fastest s(t), then sample it on time stamps.
     _, first, second = curve.evaluate(list_places())
     law = compute_fastest_law(first, second, limits.velocity, limits.acceleration)
     motion = _sample_on_stamps(path, curve, law, limits, period)
@@ -187,18 +189,18 @@ def _spread_limits(chart: Chart, name: str, value: ArrayLike) -> Array:
 def _sample_on_stamps(
     path: ToolPath, curve: JointCurve, law: TimeLaw, limits: MotionLimits, period: float
 ) -> JointMotion:
-    """The motion at multiples of the period, slower until these and other instants keep the limits."""
+    """The motion at multiples of the period, slowed down until the limits hold at these and other instants."""
     law = _slow_down(law, limits, *_evaluate_motion(curve, law, np.linspace(0.0, law.duration, RULES.instants))[2:])
     for _ in range(RULES.stretches):
         stamps = max(4, int(np.ceil(law.duration / period - 1e-9)))
         if stamps > RULES.most_stamps:
             raise InvalidValueError(
-                "period", period, f"at most {RULES.most_stamps} time stamps in {law.duration:.3g} s"
+                "period", period, f"a period with at most {RULES.most_stamps} time stamps in {law.duration:.3g} s"
             )
         law = law.stretch(stamps * period)
         times = period * np.arange(stamps + 1, dtype=float)
         s, q, dq, ddq = _evaluate_motion(curve, law, times)
-        # Stamps may fall on corners between the other instants.
+        # The largest values may occur at time stamps between the other instants.
         slower = _slow_down(law, limits, dq, ddq)
         if slower is law:
             break
@@ -227,13 +229,13 @@ def _slow_down(law: TimeLaw, limits: MotionLimits, dq: Array, ddq: Array) -> Tim
 
 @dataclass(frozen=True, eq=False)
 class MotionLimits:
-    """What a motion has to keep."""
+    """Limits and clearances that a motion must respect."""
 
     chart: Chart
     velocity: Array  #: (n,) [rad/s] or [m/s]
     acceleration: Array  #: (n,) [rad/s^2] or [m/s^2]
     collisions: Collisions | None
-    clearance: float  #: smallest distance of their pairs to allow [m]
+    clearance: float  #: smallest allowed distance of their pairs [m]
 
     @property
     def rows(self) -> ca.Function:
@@ -264,12 +266,12 @@ class MotionLimits:
         return BlockedFunction(self.rows)
 
     def check_kept(self, path: ToolPath, s: Array, q: Array) -> None:
-        """Raise PathError at the first place (P,) whose joint position (P, n) is lost or outside."""
+        """Raise PathError at the first parameter (P,) whose joint position (P, n) is not finite or outside."""
         finite = np.flatnonzero(np.isfinite(q).all(axis=1))
         kept = finite[self.chart.problem.domain.contains(q[finite])]
         if len(kept) == len(q):
             return
-        # what is wrong with the first of the others
+        # Find the reason at the first bad position.
         k = int(np.setdiff1d(np.arange(len(q)), kept)[0])
         if not np.isfinite(q[k]).all():
             raise self.build_lost_error(path, LostCurve(s[:k], q[:k], float(s[k])))
@@ -280,11 +282,11 @@ class MotionLimits:
     def check_contacts(self, path: ToolPath, motion: JointMotion) -> None:
         """Raise PathError where a pair may come nearer than the clearance, at time stamps or between them.
 
-        Between two stamps a motion is at most a h^2 / 8 from the straight way, with the limits a of acceleration.
+        Between two stamps, a motion is at most a h^2 / 8 from the straight line, with the acceleration limits a.
         """
         if self.collisions is None:
             return
-        # between samples the joints leave the chord by at most this
+        # Largest deviation from the chord between samples.
         bend = self.acceleration * (motion.times[1] - motion.times[0]) ** 2 / 8
         contact = self.collisions.find_contact(motion.q, self.clearance, bend)
         if contact is None:
@@ -299,7 +301,7 @@ class MotionLimits:
         )
 
     def build_lost_error(self, path: ToolPath, end: LostCurve) -> PathError:
-        """The error for a path that ends before s = 1."""
+        """The error for a curve that ends before s = 1."""
         where = path.describe_place(end.beyond, self.chart.labels)
         return PathError(
             f"the path cannot be reached {where}: no joint position near the one before it has this x and xi, "
@@ -307,7 +309,7 @@ class MotionLimits:
         )
 
     def _describe_reach(self, q: Array) -> str:
-        """How far the coordinates reach at a joint position before the end, if it lies inside the domain."""
+        """The ranges of the coordinates at the last good joint position, as text; empty outside the domain."""
         try:
             reach = xi_range(self.chart, q)
         except InvalidValueError:
@@ -316,13 +318,13 @@ class MotionLimits:
         return f"; just before, the coordinates reach {ranges} one at a time"
 
     def measure_margins(self, q: Array, dq: Array, ddq: Array) -> Margins:
-        """Room that a motion leaves at its time stamps: to limits, singular positions and contacts."""
-        # Room to the boundary, relative to the half-widths.
+        """Margins of a motion at its time stamps: to limits, to singular positions and to contacts."""
+        # Distance to the boundary, relative to the half-widths.
         low, high = self.chart.problem.domain.bounds
         room = np.minimum(q - low, high - q) / self.chart.problem.domain.half_width
         worst = int(np.argmin(room.min(axis=0)))
         bounded = bool(np.isfinite(room).any())
-        # The least singular value, and the nearest pair.
+        # Least singular value, and nearest pair.
         values = np.linalg.svd(self.compute_scaled_jacobian(q), compute_uv=False)
         near = None if self.collisions is None else self.collisions.distance(q)
         k = -1 if near is None else int(np.argmin(near.distance))

@@ -1,4 +1,4 @@
-"""Joint curves of a tool path, and the fastest law of time along one."""
+"""Joint curves of tool paths, and the fastest time law along a curve."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -58,11 +58,11 @@ Goal = Callable[..., Array]  #: s, order of the derivative -> phi or its rates, 
 
 @dataclass(frozen=True, eq=False)
 class LostCurve:
-    """A curve that ends early."""
+    """The part of a curve before it is lost."""
 
-    s: Array  #: (N,) parameters that were reached
+    s: Array  #: (N,) parameters reached
     q: Array  #: (N, n) their joint positions
-    beyond: float  #: the first parameter that was not reached
+    beyond: float  #: the first parameter not reached
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,13 +75,13 @@ class JointCurve:
 
     @classmethod
     def trace(cls, solver: PhiSolver, goal: Goal, q_start: Array) -> "JointCurve | LostCurve":
-        """Follow phi(s) from s = 0, where q_start (n,) is the guess, by Euler steps and Newton's method."""
+        """Follow phi(s) from s = 0, starting near q_start (n,), by Euler steps and Newton's method."""
         q = solver.solve(q_start[None], goal(np.zeros(1)))[0]
         if not np.isfinite(q).all():
             return LostCurve(np.empty(0), np.empty((0, len(q_start))), 0.0)
         s, h = [0.0], RULES.first_step
         points, slopes = [q], [_compute_slope(solver, q, goal(0.0, 1))]
-        # Euler steps as long as Newton's method finds the curve again near by; shorter ones where it does not.
+        # Take Euler steps while Newton's method finds the curve nearby, and shorter ones where it fails.
         while s[-1] < 1:
             h = min(h, 1 - s[-1], RULES.curve_step / max(float(np.abs(slopes[-1]).max()), 1e-12))
             new, q = s[-1] + h if s[-1] + h < 1 - 1e-12 else 1.0, points[-1]
@@ -108,13 +108,13 @@ class JointCurve:
         J q' = phi' and J q'' = phi'' - d2phi(q)[q', q'].
 
         Raises:
-            PathError: if Newton's method fails at one of them.
+            PathError: if Newton's method fails at a parameter.
         """
         q = self.q(s)
         bad = np.flatnonzero(np.isnan(q).any(axis=1))
         if bad.size:
             raise PathError(f"the path cannot be followed at s = {s[bad[0]]:.6g}: the chart is nearly singular there")
-        # J q' = phi', and J q'' is what of phi'' the bending of phi does not give.
+        # J q' = phi', and J q'' = phi'' - d2phi(q)[q', q'].
         J = self.solver.jacobian(q)
         first = solutions_of(J, self.goal(s, 1)[..., None])[..., 0]
         bend = self.goal(s, 2) - self.solver.compute_turning(q, first, first)
@@ -142,12 +142,12 @@ class TimeLaw:
         return float(self.times[-1])
 
     def stretch(self, duration: float) -> "TimeLaw":
-        """The same motion in another time."""
+        """The same motion with another duration."""
         factor = duration / self.duration
         return TimeLaw(self.times * factor, self.s, self.speed / factor)
 
     def evaluate(self, times: Array) -> tuple[Array, Array, Array]:
-        """s, ds/dt and d2s/dt2 at times (N,): parts of constant acceleration."""
+        """s, ds/dt and d2s/dt2 at times (N,); the acceleration is piecewise constant."""
         k = np.clip(np.searchsorted(self.times, times, side="right") - 1, 0, len(self.times) - 2)
         since, length = times - self.times[k], self.times[k + 1] - self.times[k]
         acceleration = (self.speed[k + 1] - self.speed[k]) / length
@@ -156,12 +156,12 @@ class TimeLaw:
 
 
 def list_places() -> Array:
-    """The parameters s at which `compute_fastest_law` wants q' and q'', (P,)."""
+    """The parameters s at which `compute_fastest_law` needs q' and q'', (P,)."""
     return np.linspace(0.0, 1.0, RULES.parts * RULES.part_places)
 
 
 def compute_fastest_law(first: Array, second: Array, velocity: Array, acceleration: Array) -> TimeLaw:
-    """The fastest profile.
+    """The fastest time law within the limits, from rest to rest.
 
     Args:
         first: q' at `list_places()`, (P, n).
@@ -172,15 +172,15 @@ def compute_fastest_law(first: Array, second: Array, velocity: Array, accelerati
     Raises:
         SolveError: if the linear program fails.
     """
-    # z(s) = (ds/dt)^2 is a spline with q'' z + q' z' / 2 as acceleration, which is linear in its coefficients.
+    # Let z(s) = (ds/dt)^2 be a spline. The joint acceleration q'' z + q' z' / 2 is linear in its coefficients.
     inner = np.linspace(0.0, 1.0, RULES.law_pieces + 1)
     knots = np.concatenate([np.zeros(RULES.law_degree), inner, np.ones(RULES.law_degree)])
     moves = np.maximum(np.abs(first), RULES.turning_slope * np.abs(first).max(axis=0) + 1e-12)
     speeds = ((velocity / moves) ** 2).min(axis=1)
     slowest = _find_worst(-speeds)
-    # Velocities: z <= (velocity / q')^2 where it is least in each part of the path.
+    # Velocity limits: z <= (velocity / q')^2 at the tightest place in each part of the path.
     rows, bounds = [_evaluate_basis(slowest, knots)[0]], [speeds[slowest]]
-    # Accelerations of each joint, where it turns most in each part.
+    # Acceleration limits of each joint, at the sharpest turn in each part.
     for i in range(first.shape[1]):
         if np.abs(first[:, i]).max() > 1e-12:
             k = _find_worst(np.abs(second[:, i]))
@@ -191,15 +191,15 @@ def compute_fastest_law(first: Array, second: Array, velocity: Array, accelerati
     limits, matrix = np.concatenate(bounds), vstack(rows).tocsr()
     scale = float(limits[: RULES.parts].min())
     size = len(knots) - RULES.law_degree - 1
-    # From rest to rest, as fast as possible in between.
+    # Maximise the speed, with rest at both ends.
     ends = [(0.0, 0.0), *[(0.0, None)] * (size - 2), (0.0, 0.0)]
     gain = -np.asarray(rows[0].sum(axis=0)).ravel()
     solution = linprog(gain, matrix, limits / scale, bounds=ends, method="highs")
     if solution.x is None or solution.x.max() <= 0:
-        raise SolveError(f"the speed profile of a path was not found: {solution.message}")
-    # time along the path: steps of constant acceleration take 2 ds / (speed before + speed after)
+        raise SolveError(f"no speed profile was found for the path: {solution.message}")
+    # Integrate time: steps of constant acceleration take 2 ds / (speed before + speed after).
     z = BSpline(knots, solution.x * scale, RULES.law_degree)
-    # Finer near the ends, where the speed changes most.
+    # Use a finer grid near the ends, where the speed changes most.
     s = (1 - np.cos(np.linspace(0.0, np.pi, RULES.time_steps + 1))) / 2
     squares = z(s)
     squares = np.maximum(squares, RULES.least_square * squares.max())
@@ -210,13 +210,13 @@ def compute_fastest_law(first: Array, second: Array, velocity: Array, accelerati
 
 
 def _find_worst(values: Array) -> Indices:
-    """The place with the largest value (P,) in each part of the path, (_BINS,)."""
+    """The index of the largest value (P,) in each part of the path, (_BINS,)."""
     parts = values.reshape(RULES.parts, RULES.part_places)
     return np.asarray(np.arange(RULES.parts) * RULES.part_places + parts.argmax(axis=1), dtype=np.int64)
 
 
 def _evaluate_basis(k: Indices, knots: Array) -> tuple[coo_array, coo_array]:
-    """Values and derivatives of the basis at places k (P,), (P, size) each."""
+    """Values and derivatives of the basis at indices k (P,), (P, size) each."""
     basis = BSpline(knots, np.eye(len(knots) - RULES.law_degree - 1), RULES.law_degree)
     s = list_places()[k]
     return coo_array(np.asarray(basis(s))), coo_array(np.asarray(basis.derivative()(s)))

@@ -1,4 +1,4 @@
-"""Motions of joints: the result of `orthocas.follow`, and recordings by name, CSV or MCAP files of rosbag2."""
+"""Joint motions: the result of `orthocas.follow`, and recordings from CSV files or MCAP files of rosbag2."""
 
 import csv
 import io
@@ -19,26 +19,30 @@ from orthocas.tools.files import publish, read_table, require_replaceable, requi
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-_HEAD = "time_s"  # first column of our files
-_CLOSED = 1e-6  # [rad] or [m]; what a closed loop leaves over is rounding
-_MOST = 5_000_000  # instants
+# First column of our files.
+_HEAD = "time_s"
+# [rad] or [m]; a closed loop returns up to this rounding error.
+_CLOSED = 1e-6
+# Largest number of instants.
+_MOST = 5_000_000
 _MAGIC = b"\x89MCAP0\r\n"
-_LATEST = 1e11  # [s]; times may count from 1970
+# [s]; times may count from 1970.
+_LATEST = 1e11
 _TIMES = ("time_s", "__time", "time", "timestamp", "t")
 _JOINT_STATE = ("sensor_msgs/msg/JointState", "sensor_msgs/JointState")
 
 
 @dataclass(frozen=True)
 class Margins:
-    """How far a motion stays from its limits, at its time stamps."""
+    """Margins of a motion to its limits, at its time stamps."""
 
     boundary: float  #: smallest distance of a joint to the boundary of the domain, in half-widths
     boundary_joint: str  #: the joint that comes closest, or ""
-    velocity: float  #: largest share of a velocity limit that is used, at most 1
-    acceleration: float  #: largest share of an acceleration limit that is used, at most 1
+    velocity: float  #: largest used fraction of a velocity limit, at most 1
+    acceleration: float  #: largest used fraction of an acceleration limit, at most 1
     singular_value: float  #: smallest relative singular value of the task, see `orthocas.ClearBox`
     distance: float  #: smallest distance of a pair [m]; inf without a collision model
-    distance_pair: str  #: the names of the two, or ""
+    distance_pair: str  #: names of that pair, or ""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -54,7 +58,8 @@ class JointMotion(Shown):
     x: Array  #: (N, m) task values
     xi: Array  #: (N, r)
     s: Array  #: (N,) parameter of the path, from 0 to 1
-    left_over: Array | None  #: (n,) what the path leaves over in the joints, `ChartParts.left_over`; None: open
+    #: (n,) change of the joints after the closed path, `ChartParts.left_over`; None: the path is open
+    left_over: Array | None
     margins: Margins
 
     def __post_init__(self) -> None:
@@ -67,12 +72,12 @@ class JointMotion(Shown):
 
     @property
     def closed(self) -> bool:
-        """Whether x, xi and the joints end where they began, joints that turn without end up to full turns."""
+        """Whether x, xi and the joints end where they began; endless joints may differ by full turns."""
         return self.left_over is not None and bool(np.abs(self.left_over).max() < _CLOSED)
 
     @property
     def kind(self) -> str:
-        """Open, closed, or around a turn: then x and xi come back and the joints do not."""
+        """Open, closed, or "around a turn": x and xi return, but the joints do not."""
         if self.left_over is None or self.closed:
             return f"{'closed' if self.closed else 'open'} path"
         k = int(np.argmax(np.abs(self.left_over)))
@@ -88,11 +93,11 @@ class JointMotion(Shown):
 
     @property
     def period(self) -> float:
-        """Distance of the time stamps [s]."""
+        """Interval between time stamps [s]."""
         return float(self.times[1])
 
     def facts(self) -> dict[str, str]:
-        """Length, what moves, and what is left to the limits."""
+        """Duration, motion, and margins to the limits."""
         kept, r = self.margins, self.xi.shape[1]
         ranges = zip(self.labels[-r:], self.xi.min(axis=0), self.xi.max(axis=0), strict=True)
         near = f" (joint '{kept.boundary_joint}')" if kept.boundary_joint else ""
@@ -107,8 +112,9 @@ class JointMotion(Shown):
 
     def plot(self) -> "Figure":
         """Joints, speeds, task values and coordinates over time, as a matplotlib figure."""
-        # joint positions and speeds on the left, task values and coordinates on the right, all over time
-        from orthocas.tools.picture import Picture  # matplotlib takes a third of a second
+        # Left: joint positions and speeds; right: task values and coordinates.
+        # matplotlib takes a third of a second to import.
+        from orthocas.tools.picture import Picture
 
         figure = Picture(figsize=(10.5, 5.0), layout="constrained")
         grid: Any = figure.subplots(2, 2, sharex=True)
@@ -125,16 +131,15 @@ class JointMotion(Shown):
     def save_csv(self, path: str | Path, force: bool = False) -> None:
         """Write a CSV file: time_s, then q, dq and ddq of each joint, task values, and coordinates.
 
-        The file appears whole or not at all. It replaces a file that this method wrote, and with `force` any file.
+        The file appears complete or not at all. It replaces a file that this method wrote, and with `force` any file.
 
         Raises:
-            PathFileError: if the folder is missing or not writable, or there is another file, or a symbolic link.
+            PathFileError: if the folder is missing or not writable, or the path is a symbolic link or any other file.
         """
         target = as_path("path", path)
         require_place(target, force)
         text = io.StringIO()
         writer = csv.writer(text, lineterminator="\n")
-        # q, then dq, then ddq of all joints; x and xi last.
         rates = [f"{order}_{name}" for order in ("d", "dd") for name in self.joint_names]
         writer.writerow([_HEAD, *self.joint_names, *rates, *self.labels])
         table = np.column_stack([self.times, self.q, self.dq, self.ddq, self.x, self.xi])
@@ -144,13 +149,14 @@ class JointMotion(Shown):
 
 
 def require_place(path: Path, force: bool) -> None:
-    """Check, before long work, that `JointMotion.save_csv` can write there.
+    """Check, before long work, that `JointMotion.save_csv` can write a file.
 
     Raises:
-        PathFileError: if the folder is missing or not writable, or there is a file of others, or a symbolic link.
+        PathFileError: if the folder is missing or not writable, or the path is a symbolic link or a file of other
+            origin.
     """
     require_writable(path, PathFileError)
-    # our own files begin like those of `save_csv`
+    # Files of ours begin with the header of `save_csv`.
     try:
         with path.open("rb") as stream:
             ours = stream.read(len(_HEAD) + 1) == f"{_HEAD},".encode()
@@ -160,7 +166,7 @@ def require_place(path: Path, force: bool) -> None:
 
 
 def _draw(axes: Any, times: Array, values: Array, names: Sequence[str], label: str) -> None:
-    """One line for each column."""
+    """Draw one line for each column."""
     lines = axes.plot(times, np.asarray(values), linewidth=1.4)
     axes.set_ylabel(label, fontsize=9)
     axes.set_xlim(times[0], times[-1])
@@ -171,24 +177,24 @@ def _draw(axes: Any, times: Array, values: Array, names: Sequence[str], label: s
 
 
 def read_joints(path: str | Path, robot: Robot, topic: str | None = None) -> tuple[Array, Array]:
-    """Times and joint positions of a recording, for the joints of a robot in its order.
+    """Read times and joint positions of a robot from a recording, in the order of its joints.
 
-    - A CSV file has a column of times in seconds, named time_s, __time, time, timestamp or t, and one for each joint:
-      its name, or a path that ends in it or in it and "position", such as PlotJuggler's
-      `/joint_states/panda_joint1/position`.
-    - An MCAP file of rosbag2 has sensor_msgs/JointState messages. Joints may come in several messages: a row is added
-      with each message once all joints are known.
+    - A CSV file has a column of times in seconds, named time_s, __time, time, timestamp or t, and one column per joint.
+      Its name is the joint's name, or a path that ends in that name, or in that name and "position", such as
+      PlotJuggler's `/joint_states/panda_joint1/position`.
+    - An MCAP file of rosbag2 has sensor_msgs/JointState messages. Joints may be spread over several messages: once all
+      joints are known, each message adds a row.
 
     Args:
         path: the file.
-        robot: whose joints are read; other columns and joints are left out.
-        topic: of the messages in an MCAP file; default: all topics with JointState messages.
+        robot: the robot; other columns and joints are ignored.
+        topic: topic of the messages in an MCAP file; default: all topics with JointState messages.
 
     Returns:
-        Times (N,) from the first one [s], not decreasing, and positions (N, n) [rad] or [m].
+        Times (N,) since the first one [s], not decreasing, and positions (N, n) [rad] or [m].
 
     Raises:
-        PathFileError: names the file, and what is wrong there.
+        PathFileError: names the file and the error.
         MissingExtraError: if an MCAP file needs a package that is not installed.
     """
     require_kind("robot", robot, Robot)
@@ -199,7 +205,7 @@ def read_joints(path: str | Path, robot: Robot, topic: str | None = None) -> tup
             is_mcap = stream.read(len(_MAGIC)) == _MAGIC
     except OSError as error:
         raise PathFileError(f"recording {file}: cannot be read, {error.strerror}") from None
-    # messages of rosbag2, or columns of a table
+    # Read messages of rosbag2, or columns of a table.
     if is_mcap:
         rows = np.array(list(_read_messages(file, joints, topic))).reshape(-1, robot.n + 1)
     else:
@@ -212,12 +218,12 @@ def read_joints(path: str | Path, robot: Robot, topic: str | None = None) -> tup
 
 
 def _find_columns(names: Sequence[str], joints: Sequence[str]) -> list[int]:
-    """The columns of the times and of each joint; raises ValueError if one is missing or not the only one."""
+    """Indices of the columns of time and of each joint; raises ValueError if one is missing or ambiguous."""
     times = [names.index(name) for name in _TIMES if name in names]
     if not times:
         raise ValueError(f"line 1: a column of times is missing, expected one of {', '.join(_TIMES)}")
     columns = times[:1]
-    # each joint once; columns are called JOINT, TOPIC/JOINT, or .../JOINT/position, with dots or slashes
+    # Each joint needs one column, named JOINT, TOPIC/JOINT, or .../JOINT/position, with dots or slashes.
     parts = [name.replace(".", "/").split("/") for name in names]
     for joint in joints:
         found = [
@@ -233,7 +239,7 @@ def _find_columns(names: Sequence[str], joints: Sequence[str]) -> list[int]:
 
 
 def _read_messages(file: Path, joints: Sequence[str], topic: str | None) -> Iterator[list[float]]:
-    """Rows of a time and all joints, from the messages of an MCAP file in the order of their times."""
+    """Rows of a time and all joints, from the messages of an MCAP file in the order of time."""
     reading: Any = import_extra("mcap.reader", "reading MCAP files", "recordings")
     decoding: Any = import_extra("mcap_ros2.decoder", "reading MCAP files", "recordings")
     known: dict[str, float] = {}
@@ -253,5 +259,5 @@ def _read_messages(file: Path, joints: Sequence[str], topic: str | None) -> Iter
     except OSError as error:
         raise PathFileError(f"recording {file}: cannot be read, {error.strerror}") from None
     except Exception as error:
-        # The libraries raise errors of many kinds for damaged files.
-        raise PathFileError(f"recording {file}: no MCAP file of rosbag2, or damaged: {error}") from None
+        # The libraries raise many kinds of errors for damaged files.
+        raise PathFileError(f"recording {file}: not an MCAP file of rosbag2, or damaged: {error}") from None

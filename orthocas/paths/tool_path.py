@@ -1,4 +1,4 @@
-"""Plans of tool paths: splines through waypoints, and files of paths."""
+"""Tool paths as splines through waypoints, and path files."""
 
 from __future__ import annotations
 
@@ -26,56 +26,56 @@ MOST_WAYPOINTS = 100_000
 
 @dataclass(frozen=True, slots=True)
 class PathRules:
-    """Numbers of tool paths and the motions along them."""
+    """Numbers of tool paths and of motions along them."""
 
-    samples: int = 501  #: of a path that is given as a function
+    samples: int = 501  #: samples of a path that is given as a function
     same_ends: float = 1e-9  #: distance of the ends of closed paths, relative to the sizes of the task
 
-    residual: float = 1e-10  #: of phi at all positions of a motion, relative to `ChartParts.phi_sizes`
+    residual: float = 1e-10  #: residual of phi at all positions of a motion, relative to `ChartParts.phi_sizes`
     curve_step: float = 0.15  #: longest step of q along the path [rad] or [m]
-    first_step: float = 0.01  #: of s
-    shortest_step: float = 1e-6  #: of s, below which the path is lost
+    first_step: float = 0.01  #: first step of s
+    shortest_step: float = 1e-6  #: step of s below which the path is lost
 
-    law_degree: int = 3  #: of the spline z(s), the square of the speed
-    law_pieces: int = 60  #: of that spline
-    parts: int = 300  #: of the path in which the limits count, where a joint turns most
-    part_places: int = 8  #: of each part
-    turning_slope: float = 0.01  #: fraction of its largest slope that a joint counts with where the path turns back
-    time_steps: int = 6000  #: of the integration of time
+    law_degree: int = 3  #: degree of the spline z(s), the square of the speed
+    law_pieces: int = 60  #: number of pieces of that spline
+    parts: int = 300  #: parts of the path; in each, the limits are imposed where a joint turns most
+    part_places: int = 8  #: places in each part
+    turning_slope: float = 0.01  #: smallest slope of a joint, as a fraction of its largest, where the path reverses
+    time_steps: int = 6000  #: steps in the integration of time
     least_square: float = 1e-9  #: smallest z inside the path, relative to its largest value
 
-    to_full_speed: float = 0.5  #: time to the velocity limit with the default acceleration limits [s]
-    instants: int = 2001  #: at which the limits are kept besides the time stamps
-    stretches: int = 20  #: of time, at most, until the stamps keep the limits
-    stretch_margin: float = 1.001  #: a little more than needed
+    to_full_speed: float = 0.5  #: [s] to reach the velocity limit under the default acceleration limits
+    instants: int = 2001  #: instants at which the limits are checked in addition to the time stamps
+    stretches: int = 20  #: largest number of stretchings of time until the limits hold
+    stretch_margin: float = 1.001  #: factor by which time is stretched beyond the need
     most_stamps: int = 1_000_000
-    returns: float = 1e-8  #: of phi, relative to its sizes: a path ends where it began
+    returns: float = 1e-8  #: tolerance of phi for a path that ends where it began, relative to its sizes
 
-    scale_samples: int = 256  #: of the domain, for the scale of the task Jacobian
-    inside: float = 0.97  #: fraction of the half-width beyond which the residual of a joint is a straight line
-    regular: float = 0.1  #: relative singular value: scale of its residual
-    nearly_singular: float = 0.02  #: where the line of that residual begins
-    away: float = 0.02  #: distance of a pair: scale of its residual [m]
-    nearest: int = 6  #: pairs of parts with such residuals, the nearest ones by the bounds of their capsules
-    stations: int = 49  #: of the search of all xi along a path that contacts stop
-    station_parts: int = 8  #: of steps along the self-motions there, of up to 0.4 rad or m
-    station_postures: int = 300  #: of a station at most
-    station_step: float = 0.35  #: longest between stations, of a joint [rad] or [m]
-    station_places: int = 3  #: between stations, at which edges are checked
-    too_near: float = 0.004  #: where the line of that residual begins [m]
+    scale_samples: int = 256  #: samples of the domain, for the scale of the task Jacobian
+    inside: float = 0.97  #: fraction of the half-width beyond which a joint's residual continues as a straight line
+    regular: float = 0.1  #: scale of the residual of the relative singular value
+    nearly_singular: float = 0.02  #: singular value below which that residual continues as a straight line
+    away: float = 0.02  #: scale of the residual of a pair's distance [m]
+    nearest: int = 6  #: number of nearest pairs of parts with such residuals, by bounds of their capsules
+    stations: int = 49  #: stations of the search of all xi, for paths that contacts block
+    station_parts: int = 8  #: parts of each step along the self-motions there, of up to 0.4 rad or m
+    station_postures: int = 300  #: most postures of a station
+    station_step: float = 0.35  #: longest joint step between stations [rad] or [m]
+    station_places: int = 3  #: places between two stations at which edges are checked
+    too_near: float = 0.004  #: distance below which the residual of a pair continues as a straight line [m]
 
-    walk_steps: int = 3  #: at each place
-    walk_step: float = 0.1  #: longest [rad] or [m]
+    walk_steps: int = 3  #: steps of a walk at each place
+    walk_step: float = 0.1  #: longest step of a walk [rad] or [m]
     walk_damping: float = 1e-2
-    fewest_pieces: int = 20  #: of the spline xi(s)
+    fewest_pieces: int = 20  #: fewest pieces of the spline xi(s)
     most_pieces: int = 60
-    piece_density: float = 10  #: pieces on a path as long as x moves over the domain
-    cost_places: int = 8  #: where costs count, on every piece
-    speed_weight: float = 2e-2  #: of the square of xi'
-    bend_weight: float = 1e-4  #: of the square of xi''
+    piece_density: float = 10  #: pieces per length of the path, relative to the range of x over the domain
+    cost_places: int = 8  #: places on every piece at which costs are evaluated
+    speed_weight: float = 2e-2  #: weight of the square of xi'
+    bend_weight: float = 1e-4  #: weight of the square of xi''
     iterations: int = 40
-    least_gain: float = 1e-3  #: relative decrease of the cost that ends the iterations
-    damping: float = 1e-2  #: at first
+    least_gain: float = 1e-3  #: the iterations end if the cost decreases by less than this, relative
+    damping: float = 1e-2  #: initial damping
     most_damping: float = 1e8
 
 
@@ -111,21 +111,21 @@ def sample_path(name: str, path: Any, size: int, labels: tuple[str, ...]) -> Arr
 
 
 class TaskSpline:
-    """A spline x(s) through task values: cubic, in quaternions of length 1 for a whole orientation.
+    """A spline x(s) through task values; it is cubic, and for a whole orientation it is cubic in unit quaternions.
 
-    Orientations go from each to the next by the shorter turn, half a turn from the reference of the task too.
+    Orientations take the shorter turn between waypoints, also through half a turn from the reference of the task.
 
     Args:
-        relative: the task.
+        relative: errors and rates of the task.
         s: parameters (N,).
         points: task values (N, m).
-        sizes: of the components, (m,).
+        sizes: sizes of the components, (m,).
     """
 
     def __init__(self, relative: Relative, s: Array, points: Array, sizes: Array) -> None:
         self._relative, self._s = relative, s
         rows = points
-        # Orientations as quaternions, each nearer to the one before than its opposite is.
+        # Convert orientations to quaternions, each with the sign nearer to the previous one.
         if relative.turned:
             p = Batched(relative.task.quaternion_function)(points)[0]
             turns = np.where((p[1:] * p[:-1]).sum(axis=1) < 0, -1.0, 1.0)
@@ -135,12 +135,12 @@ class TaskSpline:
         away = np.abs(rows[-1] - rows[0])
         self.returns = (
             bool((away <= RULES.same_ends * sizes).all()) and len(rows) > 2
-        )  #: to its first point, without a full turn
+        )  #: displacement of the closed path to its first point, without a full turn
         self._rows = rows
         self._curve = build_spline(s, rows, False)
 
     def close(self) -> TaskSpline:
-        """The path, periodic."""
+        """The path as a periodic spline."""
         self._curve = build_spline(self._s, self._rows, True)
         return self
 
@@ -155,12 +155,12 @@ class TaskSpline:
         return np.asarray(x.reshape(*rows.shape[:-1], -1))
 
     def evaluate_rates(self, s: ArrayLike, order: int) -> Array:
-        """The first or second derivative: with `Relative.rates` J, J q' and J q'' + dJ/ds q' of joints that follow."""
+        """The first or second derivative of x. With the J of `Relative.rates`, it is J q' or J q'' + dJ/ds q'."""
         rows = [np.asarray(self._curve(s, k)) for k in range(order + 1)]
         if not self._relative.turned:
             return rows[order]
         first = self._relative.first
-        # omega = 2 conj(p) p' / |p|^2, and its derivative, in the tip's axes.
+        # omega = 2 conj(p) p' / |p|^2 and its derivative, in the tip's axes.
         p, *slopes = (row[..., first:] for row in rows)
         square = (p**2).sum(axis=-1, keepdims=True)
         omega = 2 * _multiply_conjugate(p, slopes[0]) / square
@@ -178,16 +178,16 @@ def _multiply_conjugate(a: Array, b: Array) -> Array:
 
 
 def place_waypoints(steps: Array) -> Array:
-    """Parameters s (N,) of points from 0 to 1, in proportion to the lengths of the chords (N - 1, k) between them.
+    """Parameters s (N,) from 0 to 1, proportional to the lengths of the chords (N - 1, k) between points.
 
     Raises:
-        InvalidValueError: if a point repeats the one before it.
+        InvalidValueError: if a point equals the previous one.
     """
     chords = np.linalg.norm(steps, axis=1)
     repeated = np.flatnonzero(chords <= 1e-12)
     if repeated.size:
         k = int(repeated[0]) + 1
-        raise InvalidValueError(f"waypoint {k}", "the same as the one before it", "a path that moves")
+        raise InvalidValueError(f"waypoint {k}", "the same as the previous one", "different successive waypoints")
     s = np.concatenate([[0.0], np.cumsum(chords)])
     return np.asarray(s / s[-1])
 
@@ -201,14 +201,14 @@ def build_spline(s: Array, points: Array, closed: bool) -> CubicSpline:
 
 @dataclass(frozen=True, eq=False)
 class ToolPath:
-    """A path of the tool, and one of the extra coordinates."""
+    """A path of the tool, with a path of the extra coordinates."""
 
     x: TaskSpline  #: s -> (m,)
     xi: CubicSpline  #: s -> (r,)
     s: Array  #: (N,) parameters of the waypoints
     waypoints: Array  #: (N, m)
-    steps: Array  #: from each to the next, relative to the sizes of the task components, (N - 1, m)
-    is_function: bool  #: whether the path was given as a function, so that waypoints are samples of it
+    steps: Array  #: steps between waypoints, relative to the sizes of the task components, (N - 1, m)
+    is_function: bool  #: whether the path was given as a function, with waypoints as samples of it
     closed: bool
 
     @classmethod
@@ -226,13 +226,13 @@ class ToolPath:
 
     @classmethod
     def _build(cls, chart: Chart, tool_path: Any, xi: Array, s_xi: Array | None) -> ToolPath:
-        """Splines; the coordinates are at parameters of their own, or at those of the waypoints (None)."""
+        """Build the splines; the coordinates have parameters of their own, or those of the waypoints (None)."""
         target = chart.task.target
         x = (lambda s: target(tool_path(s))) if callable(tool_path) else target(tool_path)
         x = sample_path("tool_path", x, chart.m, chart.labels[: chart.m])
         if s_xi is None and len(xi) != len(x):
-            raise InvalidValueError("number of rows of xi", len(xi), f"{len(x)}, as of tool_path")
-        # s grows with the length of the chords, in units of the sizes of phi.
+            raise InvalidValueError("number of rows of xi", len(xi), f"{len(x)}, as many as tool_path has")
+        # s grows with the chord length, in sizes of the task components.
         steps = chart.parts.relative.difference(x[1:], x[:-1]) / chart.parts.phi_sizes[: chart.m]
         if callable(tool_path):
             s = np.linspace(0.0, 1.0, len(x))
@@ -248,15 +248,15 @@ class ToolPath:
         return replace(self, xi=xi)
 
     def phi(self, s: Array, order: int = 0) -> Array:
-        """phi (N, n) at parameters (N,), (n,) at one number; or its derivatives, see `TaskSpline.evaluate_rates`."""
+        """phi (N, n) at parameters (N,), (n,) at one number; or a derivative, see `TaskSpline.evaluate_rates`."""
         return np.concatenate([self.x.evaluate_rates(s, order) if order else self.x(s), self.xi(s, order)], axis=-1)
 
     def list_checks(self) -> Array:
-        """Parameters (P,) at which the path is checked: the waypoints, and between them."""
+        """Parameters (P,) at which the path is checked: at the waypoints and between them."""
         return np.union1d(self.s, np.linspace(0.0, 1.0, 1001))
 
     def describe_place(self, s: float, labels: tuple[str, ...]) -> str:
-        """A place on the path in words."""
+        """A parameter's place on the path, in words."""
         x = ", ".join(f"{label} = {value:.4g}" for label, value in zip(labels, self.x(s), strict=False))
         if self.is_function:
             return f"at s = {s:.4g} ({x})"
@@ -268,19 +268,19 @@ class ToolPath:
 
 
 def read_path(path: str | Path, chart: Chart) -> tuple[Array, Array | None]:
-    """Waypoints (N, m), and their coordinates (N, r) if the file has columns for them.
+    """Read waypoints (N, m), and their coordinates (N, r) if the file has columns for them.
 
     The columns are the chart's labels, or x, y, z, qw, qx, qy, qz for poses.
 
     Raises:
-        PathFileError: names the file, the line, and what is wrong there.
+        PathFileError: names the file, the line and the error.
     """
     task: tuple[str, ...] = ()
 
     def find(names: Sequence[str]) -> list[int]:
         nonlocal task
         task = POSE if "qw" in names else chart.labels[: chart.m]
-        # the columns of the task, then those of the coordinates if there are any
+        # Columns of the task, then of the coordinates if there are any.
         extra = chart.labels[chart.m :]
         columns = (*task, *extra) if set(extra) & set(names) else task
         for name in names:
@@ -292,7 +292,7 @@ def read_path(path: str | Path, chart: Chart) -> tuple[Array, Array | None]:
     values = read_table(path, "path file", "waypoints", MOST_WAYPOINTS, find)
     x, xi = values[:, : len(task)], values[:, len(task) :]
     if task is POSE:
-        # Files round, to three digits and more; what is farther from length 1 is no rounded unit quaternion.
+        # Files round to three digits or more. A larger deviation from length 1 is not rounding.
         lengths = np.linalg.norm(x[:, 3:], axis=1)
         if (off := np.flatnonzero(np.abs(lengths - 1) > 5e-3)).size:
             came = f"row {off[0] + 1} has a quaternion of length {lengths[off[0]]:.4g}"

@@ -1,4 +1,4 @@
-"""Choice of xi along a tool path: descents on costs, and a search of all xi where these end in a contact."""
+"""Choice of xi along a tool path: by descent on costs, or by a search of all xi if the descent ends in a contact."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True, eq=False)
 class XiSearch:
-    """Searches all xi along a tool path for a way that is clear of contacts, r = 1.
+    """Searches all xi along a tool path for a motion without contacts, for r = 1.
 
-    Of all postures on the self-motions of a station, 0.05 rad or m apart, in the domain and clear, one is chosen at
-    every station, of at most `RULES.station_postures`, evenly thinned: the sum of the costs of postures and of the
-    squared steps between them is least, by dynamic programming. From station to station, no joint moves by more than
-    `RULES.station_step`, and det J has the same sign. Where the way between two stations is not clear or leaves the
-    domain, all edges between them are checked, and the next best way is sought. Closed paths end with the posture with
-    which they begin.
+    Each station on the path has candidate postures: points of its self-motions, 0.05 rad or m apart, in the domain and
+    clear of contacts, thinned evenly to at most `RULES.station_postures`. Dynamic programming chooses one posture per
+    station that minimises the sum of the costs of postures and of the squared steps between them. Between stations, no
+    joint moves by more than `RULES.station_step`, and det J keeps its sign. If the motion between two chosen postures
+    has a contact or leaves the domain, all edges between these stations are checked, and the next best solution is
+    sought. Closed paths end at their first posture.
 
     Source:
         ours; the recursion is Viterbi's, and edges are checked late as in lazy planners.
@@ -42,18 +42,18 @@ class XiSearch:
 
     solver: PhiSolver
     path: ToolPath
-    collisions: Collisions  #: of the chart's robot
-    clearance: float  #: smallest distance of their pairs [m]
-    cost: Callable[[Array], Array]  #: of postures (N, n), (N,)
+    collisions: Collisions  #: collision model of the chart's robot
+    clearance: float  #: smallest allowed distance of its pairs [m]
+    cost: Callable[[Array], Array]  #: costs (N,) of postures (N, n)
 
     def find(self) -> tuple[Array, Array] | None:
-        """Stations s (S,) and postures there (S, n); None if there is no such way."""
+        """Stations s (S,) and postures there (S, n); None if no such motion is found."""
         s, closed = np.linspace(0.0, 1.0, RULES.stations), self.path.closed
         stations = [self._list_postures(x) for x in self.path.x(s[:-1] if closed else s)]
         stations += stations[:1] if closed else []
         if not all(len(q) for q in stations):
             return None
-        # squared steps between postures, and the costs of the later ones, (K, L); infinite for no edge
+        # Squared steps between postures plus costs of the later ones, (K, L); infinite where there is no edge.
         costs, edges = self.cost(stations[0]), list[Array]()
         for q, later in pairwise(stations):
             steps = without_turns(later[None] - q[:, None], self._endless)
@@ -65,12 +65,12 @@ class XiSearch:
             way = np.array([q[k] for q, k in zip(stations, chosen, strict=True)])
             blocked = np.flatnonzero(~self._check_between(s[:-1], s[1:], way[:-1], way[1:]))
             if not len(blocked):
-                # Joints that turn without end go on from one station to the next.
+                # Unwrap endless joints from one station to the next.
                 way[:, self._endless] = np.unwrap(way[:, self._endless], axis=0)
                 return s, way
             for k in blocked:
                 if k in checked:
-                    # rounding alone can block an edge that was clear
+                    # Rounding can block an edge that was clear, so exclude this one.
                     edges[k][chosen[k], chosen[k + 1]] = np.inf
                     continue
                 i, j = np.nonzero(np.isfinite(edges[k]))
@@ -83,18 +83,18 @@ class XiSearch:
 
     @cached_property
     def _endless(self) -> Flags:
-        """Joints that turn without end, (n,)."""
+        """Whether each joint turns endlessly, (n,)."""
         problem = self.solver.chart.problem
         return np.isin(np.arange(problem.robot.n), problem.turning)
 
     def _list_postures(self, x: Array) -> Array:
-        """Postures (K, n) with a task value in the domain that are clear of contacts."""
+        """Postures (K, n) with a task value in the domain and clear of contacts."""
         chart = self.solver.chart
         curves = chart.parts.inverse.curves
         assert curves is not None
         home = chart.problem.domain.home
         q = curves.list_points(np.append(x, chart.xi(home)), RULES.station_parts)
-        # joints that turn without end count once, and memory grows with the square of the number, or its cube
+        # Count endless joints once. Limit the number of postures, because memory grows with its square or cube.
         q = q[(np.abs(q - home)[:, self._endless] <= np.pi).all(axis=1)]
         q = q[self._check_clear(q)]
         kept: Array = q[np.linspace(0, len(q) - 1, min(len(q), RULES.station_postures)).astype(int)]
@@ -104,7 +104,7 @@ class XiSearch:
         return np.asarray(self.collisions.distance(q).distance > self.clearance, dtype=bool)
 
     def _check_between(self, s: Array, s_later: Array, q: Array, later: Array) -> Flags:
-        """Whether ways between postures (E, n) at stations (E,), on which xi changes evenly, are clear, (E,)."""
+        """Whether motions between postures (E, n) at stations (E,), with xi changing linearly, are clear, (E,)."""
         chart, kept = self.solver.chart, np.ones(len(q), dtype=bool)
         steps = without_turns(later - q, self._endless)
         xi = chart.xi(q)
@@ -122,14 +122,14 @@ class XiSearch:
 
 
 def _find_cheapest(costs: Array, edges: list[Array], closed: bool) -> list[int] | None:
-    """The posture of each station on the cheapest way, by costs of the first ones (K,) and of edges; or None."""
-    # least[i, j]: to posture j of this station, from posture i of the first one or, of open paths, from any.
+    """The posture of each station on the cheapest path, from costs of first postures (K,) and of edges; or None."""
+    # least[i, j]: cost to posture j of this station, from posture i of the first one (closed) or from any (open).
     least, before = np.where(np.eye(len(costs), dtype=bool), costs, np.inf) if closed else costs[None], list[Indices]()
     for edge in edges:
         totals = least[:, :, None] + edge
         before.append(np.argmin(totals, axis=1))
         least = np.take_along_axis(totals, before[-1][:, None, :], axis=1)[:, 0]
-    # From the best end, back along what led there.
+    # Go back from the best end.
     ends = np.where(np.eye(len(least), dtype=bool), least, np.inf) if closed else least
     first, last = np.unravel_index(int(np.argmin(ends)), ends.shape)
     if not np.isfinite(ends[first, last]):
@@ -142,7 +142,7 @@ def _find_cheapest(costs: Array, edges: list[Array], closed: bool) -> list[int] 
 
 @dataclass(frozen=True, eq=False)
 class Costs:
-    """Residuals of joint positions, and their gradients."""
+    """Residuals of joint positions, with their gradients."""
 
     limits: MotionLimits
 
@@ -163,7 +163,7 @@ class Costs:
         domain = self.limits.chart.problem.domain
         bounded = np.flatnonzero(np.isfinite(domain.bounds[0]))
         u = ((q - domain.centre) / domain.half_width)[:, bounded]
-        # u / sqrt(1 - u^2) in half-widths, and a straight line where that grows too steep.
+        # Use u / sqrt(1 - u^2) in half-widths, continued as a straight line near the boundary.
         near = np.clip(u, -RULES.inside, RULES.inside)
         slopes = (1 - near**2) ** -1.5
         residuals = near / np.sqrt(1 - near**2) + (u - near) * slopes
@@ -181,7 +181,7 @@ class Costs:
 
     @cached_property
     def _turning(self) -> Batched:
-        """q, u, v -> the gradient (n, 1) of u^T J(q) v: with singular vectors, that of the singular value."""
+        """q, u, v -> gradient (n, 1) of u^T J(q) v; with singular vectors u, v, it is that of the singular value."""
         chart = self.limits.chart
         q, v, u = ca.SX.sym("q", chart.n), ca.SX.sym("v", chart.n), ca.SX.sym("u", chart.m)
         product = ca.dot(u, self.limits.rows(q) @ v)
@@ -189,23 +189,23 @@ class Costs:
 
 
 def _evaluate_inverse(room: Array, scale: float, least: float) -> tuple[Array, Array]:
-    """scale / room and its derivative; a straight line where room is below `least`."""
+    """scale / room and its derivative, continued as a straight line where room is below `least`."""
     far = np.maximum(room, least)
     slopes = -scale / far**2
     return scale / far + (room - far) * slopes, slopes
 
 
 def walk(chart: Chart, costs: Costs, x: Array, q: Array) -> Array:
-    """Joint positions (P, n) near task values x (P, m), from q (n,).
+    """Joint positions (P, n) near task values x (P, m), starting at q (n,).
 
-    At every place, steps of least norm towards x, and Gauss-Newton steps within the null space of J_x that lower the
-    costs, as in resolved-rate control with gradient projection.
+    At every place it takes steps of least norm towards x, and Gauss-Newton steps in the null space of J_x that lower
+    the costs, as in resolved-rate control with gradient projection.
     """
     points = []
     for target in x:
         for _ in range(RULES.walk_steps):
             J = chart.parts.relative.batched_rates(q[None])[0].reshape(chart.m, chart.n)
-            # Towards x the step of least norm, within the null space (n, r) a damped Gauss-Newton step.
+            # Towards x, take the step of least norm; in the null space (n, r), a damped Gauss-Newton step.
             toward = np.linalg.pinv(J, rcond=1e-3) @ chart.parts.relative.difference(target, chart.x(q))
             inner = np.linalg.svd(J)[2][chart.m :].T
             residuals, gradients = (part[0] for part in costs(q[None]))
@@ -222,7 +222,7 @@ def _limit_step(step: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """Values of the spline, and what follows from them."""
+    """Values of the spline, and quantities that follow from them."""
 
     values: Array  #: (K, r)
     q: Array  #: (P, n)
@@ -232,35 +232,35 @@ class _State:
 
 
 class XiChoice:
-    """The problem for one tool path.
+    """The optimisation problem for one tool path.
 
     Args:
         plan: the tool path.
-        costs: of joint positions.
-        solver: solves for them.
+        costs: costs of joint positions.
+        solver: solver for joint positions.
     """
 
     def __init__(self, path: ToolPath, costs: Costs, solver: PhiSolver) -> None:
         self.path, self.costs, self.solver, self.chart = path, costs, solver, solver.chart
-        # More pieces of the spline on longer paths.
+        # Longer paths get more pieces of the spline.
         length = np.linalg.norm(path.steps, axis=1).sum()
         pieces = int(np.clip(np.ceil(RULES.piece_density * length), RULES.fewest_pieces, RULES.most_pieces))
         self.s = np.linspace(0.0, 1.0, RULES.cost_places * pieces + 1)
         self.nodes = np.linspace(0.0, 1.0, pieces + 1)
-        # Closed paths have the same value at both ends.
+        # Closed paths have equal values at both ends.
         unit = np.eye(pieces + 1)
         if path.closed:
             unit = np.vstack([unit[:pieces, :pieces], unit[:1, :pieces]])
         self._unit = unit
         basis = self._build_spline(unit)
         self._basis = basis(self.s)
-        # Little motion: the squares of xi' and xi'', as a quadratic form of the values.
+        # The squares of xi' and xi'', as a quadratic form of the values, penalise motion.
         slopes, bends = basis(self.s, 1), basis(self.s, 2)
         self._smooth = (RULES.speed_weight * slopes.T @ slopes + RULES.bend_weight * bends.T @ bends) / len(self.s)
 
     def optimise(self, first: Array) -> ToolPath:
-        """The tool path with chosen coordinates, from joint positions near it at the places `s`, (P, n)."""
-        # The spline through the coordinates of these positions, or through their mean where that has no solution.
+        """The tool path with optimised coordinates, from initial joint positions (P, n) at the places `s`."""
+        # Fit the spline to the coordinates of these positions; use their mean if Newton's method fails on it.
         xi = counted_on(self.chart.xi(first), self.chart.parts.turns[self.chart.m :])
         values = np.linalg.lstsq(self._basis, xi, rcond=None)[0]
         means = np.tile(xi.mean(axis=0), (len(values), 1))
@@ -270,7 +270,7 @@ class XiChoice:
         damping = RULES.damping
         for _ in range(RULES.iterations):
             hessian, gradient = self._build_model(state)
-            # Levenberg-Marquardt: more damping until a step lowers the cost.
+            # Levenberg-Marquardt: increase the damping until a step lowers the cost.
             better = None
             while better is None and damping < RULES.most_damping:
                 scaled = hessian + damping * np.diag(np.diag(hessian) + 1e-9)
@@ -289,7 +289,7 @@ class XiChoice:
         return CubicSpline(self.nodes, values, bc_type="periodic" if self.path.closed else "not-a-knot")
 
     def _evaluate_state(self, values: Array, near: Array) -> _State | None:
-        """The state of values (K, r), with joint positions near others; None where Newton's method fails."""
+        """The state of values (K, r), with joint positions near given ones; None if Newton's method fails."""
         goals = np.hstack([self.path.x(self.s), self._basis @ values])
         q = self.solver.solve(near, goals)
         if not np.isfinite(q).all():
@@ -301,7 +301,7 @@ class XiChoice:
     def _build_model(self, state: _State) -> tuple[Array, Array]:
         """Gauss-Newton Hessian (K r, K r) and half the gradient (K r,) of the cost."""
         r, m, B = self.chart.r, self.chart.m, self._basis
-        # Gradients with respect to xi: q moves by J^-1 [0; dxi].
+        # Gradients by xi: q moves by J^-1 [0; dxi].
         G = state.gradients @ np.linalg.inv(self.solver.jacobian(state.q))[:, :, m:] / np.sqrt(len(B))
         squares = np.einsum("pka,pkb->pab", G, G)
         hessian = np.einsum("pi,pj,pab->iajb", B, B, squares, optimize=True)

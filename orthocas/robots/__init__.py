@@ -5,8 +5,9 @@
   compares its orientation with a reference.
 - `urdf` and `mjcf` read URDF, SRDF and MJCF files; `pinocchio_model` locks joints of a `pin.Model`, converts it to a
   tree, and builds planar arms.
-- `collisions` measures distances between links and from scenes; `obstacles` has scenes and their solids, `shapes` what
-  these are made of, and `collision_files` the solids of robot files and chart files. `capsules` bounds links for C.
+- `collisions` measures distances between links, and from links to a scene. `obstacles` has the scenes and their solids,
+  `shapes` the geometry of solids, and `collision_files` reads solids from robot files and chart files. `capsules`
+  bounds links by capsules, for C.
 """
 
 from orthocas.robots.robot import Robot

@@ -1,4 +1,4 @@
-"""Capsules around the links of a robot: few for each, of little volume, that contain them."""
+"""Capsules that contain the links of a robot: few for each link, and of small volume."""
 
 from __future__ import annotations
 
@@ -26,23 +26,25 @@ __all__ = ["FittedCapsules", "fit_capsules"]
 class CapsuleRules:
     """Numbers of fitted capsules."""
 
-    ratio: float = 1.5  #: volume of a link's capsules over that of its solids: with less, it is divided no more
+    ratio: float = 1.5  #: volume of a link's capsules over that of its solids below which no piece is cut further
     most: int = 8  #: capsules of a small link
     more: int = 24  #: further capsules of a large link
-    large: float = 0.2  #: of the volume of all links: of a large link; others have further capsules in proportion
-    places: tuple[float, ...] = (0.3, 0.5, 0.7)  #: of cuts, as fractions of the extent along a principal axis
-    steps: int = 300  #: of a search for the smallest capsule
-    converged: float = 1e-6  #: of its volume, relative
-    turned: float = 1e-5  #: [rad] and radii: smaller steps end it
-    first: float = 0.2  #: its first steps
-    room: float = 1e-9  #: [m] between a corner and the surface; rounding takes a thousandth of it
-    points: int = 20_000  #: by which volumes are measured
-    few: int = 10_000  #: by which cuts are chosen
-    chunk: int = 1000  #: of these points, at once
-    thickest: float = 1e6  #: [m], of rods
-    point: float = 1e-9  #: [m]: shorter rods are balls
-    seed: int = 0  #: of these points, and of postures
-    postures: int = 1000  #: in which pairs touch that are left out
+    #: a link is large from this fraction of the volume of all links; smaller links get fewer capsules
+    large: float = 0.2
+    #: where cuts are tried, as fractions of the extent along a principal axis
+    places: tuple[float, ...] = (0.3, 0.5, 0.7)
+    steps: int = 300  #: largest number of steps of the search for the smallest capsule
+    converged: float = 1e-6  #: the search ends at this relative change of volume ...
+    turned: float = 1e-5  #: ... and at this step [rad] or [radii]
+    first: float = 0.2  #: first steps of the search [rad] or [radii]
+    room: float = 1e-9  #: [m] from a corner to the capsule's surface; rounding errors are a thousandth of it
+    points: int = 20_000  #: random points that measure a volume
+    few: int = 10_000  #: random points that compare cuts
+    chunk: int = 1000  #: points per batch
+    thickest: float = 1e6  #: [m], largest radius of rods
+    point: float = 1e-9  #: [m]; a shorter rod becomes a ball
+    seed: int = 0  #: of the random points and postures
+    postures: int = 1000  #: random postures; a pair that touches in all of them is left out
 
 
 RULES = CapsuleRules()
@@ -54,12 +56,13 @@ class FittedCapsules(Shown):
 
     collisions: Collisions  #: the same pairs, with capsules as solids
     ratios: Mapping[str, float]  #: volume of the capsules over that of the solids, by link
-    ratio: float  #: the same of all links together
-    pieces: tuple[tuple[str, Array, Part], ...]  #: links, corners (K, 3) of their pieces, and the capsules of these
-    dropped: tuple[Pair, ...] = ()  #: pairs whose capsules touch in all seeded postures, and are not checked
+    ratio: float  #: volume of all capsules over that of all links
+    #: of each capsule: its link, the corners (K, 3) of its piece, and the capsule
+    pieces: tuple[tuple[str, Array, Part], ...]
+    dropped: tuple[Pair, ...] = ()  #: pairs that are not checked, because their capsules touch in all random postures
 
     def facts(self) -> dict[str, str]:
-        """How many there are, and how much larger than the links."""
+        """Number of capsules, and their volume relative to that of the links."""
         worst = max(self.ratios, key=lambda name: self.ratios[name], default="")
         return {
             "capsules": f"{len(self.pieces)} around {len(self.ratios)} links",
@@ -70,21 +73,23 @@ class FittedCapsules(Shown):
 
 
 def fit_capsules(collisions: Collisions) -> FittedCapsules:
-    """Capsules around the solids of each link and object, for distances in C and for quick ones.
+    """Fit capsules around the solids of each link and object, to compute distances quickly or in C.
 
-    The convex hull of a link is cut by planes across its principal axes until the union of the capsules around all
-    pieces has at most 1.5 times the volume of the link, or there are eight, and up to 32 of links that have a fifth of
-    the robot's volume; each cut is the best of nine, of the piece with the most to lose. A link of several solids that
-    is not convex is cut into these first, if that is smaller.
+    Planes across its principal axes cut the convex hull of a link into pieces, and each piece gets a capsule. Each cut
+    is the best of nine candidates, on the piece whose capsule wastes most volume. Cutting stops when the union of the
+    capsules has at most 1.5 times the volume of the link, or at the largest number of capsules: 8 for small links, up
+    to 32 for links with a fifth of the robot's volume or more. A link of several solids that is not convex may start
+    from these solids instead of its hull. The smaller result is kept.
 
-    Every corner of a piece lies within its capsule, by 1e-9 m or more. A capsule is convex, so it contains the piece;
-    the pieces of a hull are all of it. So distances of capsules are never larger than those of the hulls.
+    Every corner of a piece lies at least 1e-9 m inside its capsule. A capsule is convex, so it contains the whole
+    piece, and the pieces together fill the hull. Therefore distances between capsules are never larger than those
+    between hulls.
 
-    Pairs of links whose capsules touch in all of 1,000 seeded postures would never report anything else. They are left
-    out and named in `dropped`; the hulls of `collisions` still check them.
+    Pairs of links whose capsules touch in all of 1,000 random postures carry no information. They are left out and
+    listed in `dropped`. The hulls of `collisions` still check them.
 
     Args:
-        collisions: such as `robot.collisions`. Half-spaces of a scene stay what they are.
+        collisions: for example `robot.collisions`. Half-spaces of a scene are kept as they are.
 
     Raises:
         InvalidValueError: for a point cloud.
@@ -97,7 +102,7 @@ def fit_capsules(collisions: Collisions) -> FittedCapsules:
     for part in collisions.parts:
         if isinstance(part.shape.geometry, CloudGeometry):
             raise InvalidValueError(
-                "collisions", f"with the point cloud '{part.name}'", "solids that capsules can hold"
+                "collisions", f"a model with the point cloud '{part.name}'", "solids that capsules can contain"
             )
         solids.setdefault(part.name, []).append(part)
     held = {
@@ -109,7 +114,7 @@ def fit_capsules(collisions: Collisions) -> FittedCapsules:
             kept += parts
             continue
         volume = held[name]
-        # Large links have more pieces. All of the link as one hull, or each of its solids for itself.
+        # Large links get more pieces. Start from one hull of the whole link, or from one hull for each of its solids.
         most = RULES.most + round(RULES.more * min(1.0, volume / (RULES.large * max(sum(held.values()), 1e-300))))
         corners = [part.shape.list_corners() for part in parts]
         rounding = max(radius for _, radius in corners)
@@ -124,7 +129,7 @@ def fit_capsules(collisions: Collisions) -> FittedCapsules:
         volumes += [found[1], volume]
     parts, origin = [*kept, *(part for _, _, part in pieces)], f"capsules around those {collisions.origin}"
     model = Collisions(collisions.tree, parts, collisions.pairs, collisions.missing, origin)
-    # Pairs that always touch, of links that are not solid in the world: scenes are for the user to correct.
+    # Find the pairs that always touch. Both must move, because objects of a scene are the user's to correct.
     touching = model.pair_distances(collisions.tree.centre_posture) <= 0
     for q in collisions.tree.draw_postures(RULES.postures, RULES.seed):
         if not touching.any():
@@ -144,7 +149,7 @@ def build_rods(tree: KinematicTree, radius: ArrayLike) -> Collisions:
     """Capsules from each joint's origin to the next one's, or to a tip; see `Robot.with_rods`.
 
     Raises:
-        InvalidValueError: if a radius is not above 0, or there are neither one nor n.
+        InvalidValueError: if a radius is not above 0, or `radius` has neither one nor n values.
     """
     sizes = as_float_array("radius", radius)
     if sizes.shape not in ((), (tree.n,)):
@@ -152,7 +157,7 @@ def build_rods(tree: KinematicTree, radius: ArrayLike) -> Collisions:
     radii = np.broadcast_to(sizes, (tree.n,))
     if not ((radii > 0) & (radii < RULES.thickest)).all():
         raise InvalidValueError("radius", sizes.tolist(), "lengths above 0 [m]")
-    # Body and far end of the rods on the ways to the tips, each once; nothing solid is between the joints of a base.
+    # Body and far end of each rod on the ways to the tips, once each. The joints of a moving base get no rods.
     ends: dict[tuple[int, int | str], Array] = {}
     for frame in (tree.tip, *map(tree.frame, tree.tips)):
         for start, end in pairwise(tree.carriers(frame.parent)):
@@ -180,7 +185,7 @@ class Capsule:
 
     @property
     def volume(self) -> float:
-        """[m^3]."""
+        """Volume [m^3]."""
         return float(np.pi * self.radius**2 * (float(np.linalg.norm(self.end - self.start)) + 4 / 3 * self.radius))
 
     @property
@@ -199,11 +204,11 @@ class Capsule:
         return np.asarray(self.measure_rooms(points) >= 0)
 
     def measure_rooms(self, points: Array) -> Array:
-        """Distances of points (N, 3) from the surface, (N,), positive inside."""
+        """Depth of points (N, 3) below the surface, (N,) [m], negative outside."""
         along, offsets = self.end - self.start, points - self.start
         squared, ahead = float(along @ along), offsets @ along
         s = np.clip(ahead / squared, 0.0, 1.0) if squared > 0 else np.zeros(len(points))
-        # |o - s a|^2, with the nearest point of the segment at s
+        # |o - s a|^2, where s is the place of the nearest point on the segment
         away = np.einsum("ij,ij->i", offsets, offsets) + s * (s * squared - 2 * ahead)
         return np.asarray(self.radius - np.sqrt(np.maximum(away, 0.0)))
 
@@ -211,27 +216,27 @@ class Capsule:
 def _cover(
     hulls: Sequence[Array], rounding: float, volume: float, most: int
 ) -> tuple[list[tuple[Array, Capsule]], float]:
-    """Pieces of hulls with a capsule around each, and the volume of their union.
+    """Cut hulls into pieces with a capsule around each; also returns the volume of the capsules' union.
 
     Args:
-        hulls: corners of each, (K, 3).
-        rounding: radius by which all of them are rounded.
-        volume: of what they hold [m^3].
+        hulls: corners of each hull, (K, 3).
+        rounding: radius by which all hulls are rounded.
+        volume: volume of the rounded hulls [m^3].
         most: number of pieces.
     """
     found = []
     first = [(hull, _fit_capsule(hull, rounding)) for hull in hulls]
-    # Unions are compared by the same points in a box, of which each capsule is asked once.
+    # Use the same random points for all unions, and test each capsule on them once.
     low, high = (np.array(corners) for corners in zip(*(capsule.list_box() for _, capsule in first), strict=True))
     low, high = low.min(axis=0), high.max(axis=0)
     points = np.random.default_rng(RULES.seed).uniform(low, high, (RULES.few, 3))
     each = float(np.prod(high - low)) / RULES.few
-    # Covers of two kinds of cuts: of the smallest union of all capsules, and of the smallest sum of the two new ones.
+    # Try two criteria for cuts: the smallest union of all capsules, and the smallest sum of the two new ones.
     for overlaps in (True, False):
         pieces, held = list(first), [capsule.contains(points) for _, capsule in first]
         whole = each * np.any(held, axis=0).sum()
         while whole > RULES.ratio * volume and len(pieces) < most:
-            # The piece whose capsule has most to lose, and its best cut.
+            # Take the piece whose capsule wastes most volume, and its best cut.
             order = np.argsort([_measure_hull(hull) - capsule.volume for hull, capsule in pieces])
             k, cuts = next(((int(k), cuts) for k in order if (cuts := _list_cuts(pieces[k][0]))), (0, []))
             if not cuts:
@@ -247,16 +252,16 @@ def _cover(
         found.append((pieces, whole))
         if whole <= RULES.ratio * volume:
             break
-    # The capsules of cuts were quick ones.
+    # The search used quick fits; fit the final capsules precisely.
     pieces = min(found, key=lambda cover: cover[1])[0]
     pieces = [(hull, _fit_capsule(hull, rounding)) for hull, _ in pieces] if len(pieces) > len(hulls) else pieces
     return pieces, _measure_union([capsule for _, capsule in pieces])
 
 
 def _fit_capsule(corners: Array, rounding: float, quick: bool = False) -> Capsule:
-    """A capsule of little volume around points (K, 3), each at least 1e-9 m within its surface."""
+    """A capsule of small volume around points (K, 3), each at least 1e-9 m inside its surface."""
     centre = corners.mean(axis=0)
-    # the best of the principal axes, then a search from there
+    # Start from the best principal axis, then search.
     axes = np.linalg.svd(corners - centre, full_matrices=False)[2] if len(corners) > 2 else np.eye(3)
     if len(corners) == 2:
         axes = (corners[1:] - corners[:1]) / max(float(np.linalg.norm(corners[1] - corners[0])), 1e-300)
@@ -264,24 +269,24 @@ def _fit_capsule(corners: Array, rounding: float, quick: bool = False) -> Capsul
     if not quick and len(corners) > 2:
         found = _refine(corners, best)
         best = found if found.volume < best.volume else best
-    # room for rounding, and more if a corner still lacks some
+    # Add room for rounding, and more if a corner still has too little.
     wide = Capsule(best.start, best.end, best.radius + rounding + RULES.room)
     short = float(wide.measure_rooms(corners).min()) - rounding - RULES.room / 2
     return wide if short >= 0 else Capsule(wide.start, wide.end, wide.radius - short)
 
 
 def _enclose(corners: Array, axis: Array) -> Capsule:
-    """A capsule along an axis (3,): the line through the middle of the points, and the shortest segment on it."""
+    """The shortest capsule along an axis (3,) that contains the points, on the line through their middle."""
     across = corners - np.outer(corners @ axis, axis)
     middle = (across.min(axis=0) + across.max(axis=0)) / 2
     return _shorten(corners, middle, axis, 0.0)
 
 
 def _shorten(corners: Array, place: Array, axis: Array, more: float) -> Capsule:
-    """The capsule about a line with the radius that its points need, and more, and the shortest segment on it."""
+    """The shortest capsule about a given line that contains the points; its radius is the smallest one plus `more`."""
     offsets = corners - place
     along = offsets @ axis
-    # squares of the distances from the line
+    # Squared distances from the line.
     away = np.maximum(np.einsum("ij,ij->i", offsets, offsets) - along**2, 0.0)
     radius = math.sqrt(float(away.max())) + more
     depth = np.sqrt(np.maximum(radius**2 - away, 0.0))
@@ -291,11 +296,11 @@ def _shorten(corners: Array, place: Array, axis: Array, more: float) -> Capsule:
 
 
 def _refine(corners: Array, start: Capsule) -> Capsule:
-    """The smallest capsule that a search from another one finds, over line and radius."""
+    """Search for a smaller capsule, over line and radius, from a given one."""
     middle, along = (start.start + start.end) / 2, start.end - start.start
     length = float(np.linalg.norm(along))
     axis = along / length if length > 0 else np.array([0.0, 0.0, 1.0])
-    # two tilts, two shifts and the radius
+    # Variables: two tilts, two shifts and the radius.
     side = np.linalg.svd(axis[None])[2][1:]
     size = float(start.radius)
 
@@ -316,7 +321,7 @@ def _refine(corners: Array, start: Capsule) -> Capsule:
 
 
 def _list_cuts(corners: Array) -> list[list[Array]]:
-    """Pairs of corners of the two pieces into which planes across the principal axes cut a hull."""
+    """Candidate cuts of a hull by planes across its principal axes: the corners of both pieces of each cut."""
     if len(corners) < 4:
         return []
     try:
@@ -329,14 +334,13 @@ def _list_cuts(corners: Array) -> list[list[Array]]:
     for axis in np.linalg.svd(corners[hull.vertices] - corners[hull.vertices].mean(axis=0), full_matrices=False)[2]:
         along = corners @ axis
         low, high = float(along.min()), float(along.max())
-        # planes at several places along each principal axis
         for fraction in RULES.places:
             level = low + fraction * (high - low)
             a, b = edges.T
             crossed = (along[a] - level) * (along[b] - level) < 0
             a, b = a[crossed], b[crossed]
             s = ((level - along[a]) / (along[b] - along[a]))[:, None]
-            # where the plane cuts edges, both pieces get new corners
+            # The plane cuts edges at new corners, which belong to both pieces.
             seam = corners[a] + s * (corners[b] - corners[a])
             sides = [corners[along <= level], corners[along >= level]]
             if min(map(len, sides)) and len(seam) > 2:
@@ -349,7 +353,7 @@ def _measure_hull(corners: Array) -> float:
 
 
 def _measure_union(solids: Sequence[Shape | Capsule]) -> float:
-    """The volume of a union, by seeded points in a box around each solid, weighed by how many solids hold them."""
+    """Estimate the volume of a union from random points in a box around each solid."""
     rng, count, total = np.random.default_rng(RULES.seed), RULES.points, 0.0
     low, high = (np.array(corners) for corners in zip(*(solid.list_box() for solid in solids), strict=True))
     for k, solid in enumerate(solids):
@@ -357,7 +361,7 @@ def _measure_union(solids: Sequence[Shape | Capsule]) -> float:
         inside = np.concatenate(
             [part[solid.contains(part)] for part in np.array_split(points, max(1, count // RULES.chunk))]
         )
-        # a point in k solids counts one k-th in each of them; those whose boxes are apart share none
+        # A point in k solids counts 1/k in each of them. Solids whose boxes are apart share no point.
         shared = np.ones(len(inside))
         for other in np.flatnonzero(((low < high[k]) & (high > low[k])).all(axis=1)).tolist():
             if other != k:

@@ -1,6 +1,7 @@
-"""Collisions from robot files, from chart files, and into these: solids of links, where links are, and pairs to check.
+"""Collision models from robot files and chart files: solids of links, their places, and the pairs to check.
 
-URDF files have <collision> elements, with pairs of SRDF files or found ones; MJCF files have geoms and MuJoCo's pairs.
+URDF files have <collision> elements, and their pairs come from an SRDF file or are found. MJCF files have geoms, and
+MuJoCo's rules give the pairs.
 """
 
 import os
@@ -40,22 +41,22 @@ from orthocas.tools.checks import Array, Indices, require_known
 from orthocas.tools.display import listed
 from orthocas.tools.json import get_part
 
-MJCF = ".xml"  #: how names of MJCF files end
+MJCF = ".xml"  #: ending of the names of MJCF files
 
 
 @dataclass(frozen=True, slots=True)
 class SolidRules:
-    """Numbers by which solids are read, and pairs of links are found."""
+    """Settings for reading solids and finding pairs of links."""
 
     seed: int = 0  #: of the postures
-    first: int = 1000  #: postures by which pairs are found that always touch
-    postures: int = 10_000  #: postures by which pairs are found that never come near
-    always: float = 0.95  #: fraction of postures from which on a pair touches by its make
-    near: float = 0.02  #: [m]; pairs that never come nearer are left out
+    first: int = 1000  #: random postures that find pairs which always touch
+    postures: int = 10_000  #: random postures that find pairs which never come near
+    always: float = 0.95  #: a pair that touches in this fraction of the postures touches by design
+    near: float = 0.02  #: [m]; pairs that stay farther apart than this are left out
     smallest: float = 1e-9  #: size of a shape [m]
-    same_place: float = 1e-6  #: between the joints of two files of one robot [m]
-    largest: float = 1e6  #: [m], of sizes and places in chart files
-    straight: float = 1e-6  #: of R^T R - I of poses there
+    same_place: float = 1e-6  #: [m], largest distance of equal joints in two files of one robot
+    largest: float = 1e6  #: [m], largest size or position in chart files
+    straight: float = 1e-6  #: largest entry of R^T R - I of poses in chart files
 
 
 RULES = SolidRules()
@@ -64,22 +65,21 @@ _SOLIDS = "solids of the links: robot.with_rods(radius) takes rods in their plac
 
 @dataclass(frozen=True)
 class CollisionSource:
-    """Where the solids of a robot are described."""
+    """The files that describe the solids of a robot."""
 
     urdf: Path  #: or an MJCF file, whose name ends in .xml
-    srdf: Path | None = None  #: None: one beside the URDF file or in ../srdf, with its stem or the robot's name
+    srdf: Path | None = None  #: None: the one beside the URDF file or in ../srdf with its stem or the robot's name
     locked: Mapping[str, float] = field(default_factory=dict)  #: joints that were locked, with their positions
 
     def read(self, tree: KinematicTree) -> Collisions:
-        """The solids of a robot's links and the pairs to check.
+        """Read the solids of a robot's links and the pairs to check.
 
-        Boxes, cylinders, spheres and capsules stay what they are; a mesh becomes its convex hull. With an SRDF file
-        that disables pairs, all other pairs of links on different bodies are checked. Without one, pairs are found: all
-        but neighbours, links that touch by their make, and links that never come near each other (`SolidRules`).
+        Boxes, cylinders, spheres and capsules keep their shapes; a mesh becomes its convex hull. If an SRDF file
+        disables pairs, all other pairs of links on different bodies are checked. Otherwise the pairs are found: all
+        pairs except neighbours, links that touch by design, and links that never come near each other (`SolidRules`).
 
-        Of an MJCF file, geoms that can collide are the solids, named by their bodies, and pairs are those that MuJoCo's
-        own rules let collide: by contype and conaffinity, without parents and their children, and without what is
-        excluded.
+        In an MJCF file, the solids are the geoms that can collide, named after their bodies. MuJoCo's rules select the
+        pairs: contype and conaffinity must match, and parent-child pairs and excluded pairs are left out.
 
         Raises:
             RobotError: if a file cannot be read, no link has a shape, or the joints are not those of the robot.
@@ -106,7 +106,7 @@ def _read_elements(tree: KinematicTree, source: CollisionSource) -> Collisions:
         lost = f" that can be read: no mesh of {', '.join(missing)}" if missing else ""
         raise RobotError(f"{source.urdf} has no <collision> element{lost}, expected {_SOLIDS}")
 
-    # All pairs of links on different bodies, less those that an SRDF file disables.
+    # Check all pairs of links on different bodies except those that an SRDF file disables.
     bodies = {part.name: part.body for part in parts}
     pairs = [(a, b) for a, b in combinations(bodies, 2) if bodies[a] != bodies[b]]
     srdf = _find_pairs_file(source.urdf, root.get("name", "")) if source.srdf is None else source.srdf
@@ -122,7 +122,9 @@ def _read_elements(tree: KinematicTree, source: CollisionSource) -> Collisions:
 def _read_geoms(tree: KinematicTree, source: CollisionSource) -> Collisions:
     """The solids and pairs of an MJCF file."""
     if source.srdf is not None:
-        raise RobotError(f"{source.srdf} is given with {source.urdf}, expected a URDF file with it: MJCF has own pairs")
+        raise RobotError(
+            f"{source.srdf} is given with {source.urdf}, expected a URDF file: MJCF files define their own pairs"
+        )
     compiled = compile_mjcf(source.urdf)
     solid = [i for i in range(compiled.ngeom) if compiled.geom_contype[i] or compiled.geom_conaffinity[i]]
     bodies = sorted({int(compiled.geom_bodyid[i]) for i in solid})
@@ -134,7 +136,7 @@ def _read_geoms(tree: KinematicTree, source: CollisionSource) -> Collisions:
     for i in solid:
         body = int(compiled.geom_bodyid[i])
         name = name_body(compiled, body)
-        # Solids of the world have names of their own.
+        # Geoms of the world keep their own names.
         names[i] = name if body else str(compiled.geom(i).name or name)
         place = places[name] if body else LinkPlace(-1, pin.SE3.Identity())
         geometry = _build_geom(compiled, i)
@@ -152,7 +154,7 @@ def _read_geoms(tree: KinematicTree, source: CollisionSource) -> Collisions:
         both = first in known and second in known and known.get(first) != known.get(second)
         if both and (second, first) not in pairs and _can_collide(compiled, i, k):
             pairs[first, second] = None
-    # A half-space comes second.
+    # A half-space comes second in its pair.
     planes = {part.name for part in parts if not part.shape.bounded}
     ordered = [(b, a) if a in planes else (a, b) for a, b in pairs if not {a, b} <= planes]
     return Collisions(tree, parts, ordered, tuple(missing), f"from {source.urdf.name}")
@@ -164,7 +166,7 @@ def _can_collide(compiled: Any, i: int, k: int) -> bool:
     low, high = sorted((first, second))
     if (low << 16) + high in compiled.exclude_signature.tolist():
         return False
-    # Bodies without joints between them count as one.
+    # Bodies without joints between them are one body for MuJoCo.
     a, b = (int(compiled.body_weldid[j]) for j in (first, second))
     parents = [int(compiled.body_weldid[compiled.body_parentid[j]]) for j in (a, b)]
     if a == b or (a and b and (parents[0] == b or parents[1] == a)):
@@ -185,7 +187,7 @@ def _build_geom(compiled: Any, i: int) -> Geometry | None:
     return _GEOMS[kind](size) if kind in _GEOMS else None
 
 
-_MESH = 7  #: of MuJoCo's mjtGeom
+_MESH = 7  #: MuJoCo's mjtGeom
 #: by mjtGeom, from their sizes (3,)
 _GEOMS: Mapping[int, Callable[[Array], Geometry]] = {
     0: lambda _: HalfSpaceGeometry(),
@@ -238,13 +240,13 @@ def find_pairs(collisions: Collisions) -> list[Pair]:
 
 
 def _find_neighbours(root: ElementTree.Element, solid: set[str]) -> set[frozenset[str]]:
-    """Pairs of links with solids that a joint connects, or joints with nothing but links without solids between."""
+    """Pairs of links with solids whose connection holds one joint, or several with only empty links between."""
     parents: dict[str, str] = {}
     for joint in root.findall("joint"):
         parent, child = joint.find("parent"), joint.find("child")
         if parent is not None and child is not None:
             parents[child.get("link", "")] = parent.get("link", "")
-    # From each solid upwards, past frames and empty links, to the next solid.
+    # Go up from each solid, past frames and empty links, to the next solid.
     neighbours = set()
     for link in solid:
         above = parents.get(link)
@@ -263,7 +265,7 @@ def _read_shape(path: Path, element: ElementTree.Element) -> Shape | None:
         return None
     pose = read_pose(element)
 
-    # A missing size reads as 0, and is refused like one.
+    # A missing size reads as 0, so the check for 0 refuses it.
     def sizes(*names: str, count: int = 1) -> list[Array]:
         values = [read_numbers(shape, name, count, (0.0,) * count) for name in names]
         if min(float(value.min()) for value in values) < RULES.smallest:
@@ -279,7 +281,7 @@ def _read_shape(path: Path, element: ElementTree.Element) -> Shape | None:
         case "cylinder" | "capsule":
             radius, length = (float(value[0]) for value in sizes("radius", "length"))
             solid = (CylinderGeometry if shape.tag == "cylinder" else CapsuleGeometry)(radius, length)
-        # A flat or empty mesh encloses nothing that could touch.
+        # A flat or empty mesh encloses no volume that could touch.
         case "mesh":
             try:
                 solid = HullGeometry.around(load_mesh(path, shape)[0])
@@ -306,9 +308,9 @@ def place_links(
     Joints that the robot does not have are locked as in `Robot.from_urdf`.
 
     Args:
-        path: the file, of MJCF if its name ends in .xml.
+        path: the robot file, MJCF if its name ends in .xml.
         tree: the robot.
-        names: of the links or bodies.
+        names: the links or bodies.
         locked: joints that were locked when the robot was built, with their positions [rad] or [m].
 
     Raises:
@@ -319,14 +321,14 @@ def place_links(
     if lost := [name for name in tree.body_joints if name not in (*model.names, *BASE_JOINTS)]:
         raise RobotError(f"{path} has the joints {listed(list(model.names)[1:])}, expected {listed(lost)} among them")
     model = lock_others(model, [i for i in range(1, model.njoints) if model.names[i] in tree.body_joints], mimics)
-    # Bodies that the model's joints move; the world is the base.
+    # Bodies that the model's joints move; the world counts as the base.
     carried = [-1, *(tree.body_joints.index(name) for name in list(model.names)[1:])]
     lengths = np.array([np.linalg.norm(place.translation) for place in list(model.jointPlacements)[1:]])
     apart = np.abs(lengths - np.linalg.norm(tree.translations[carried[1:]], axis=1))
     if apart.max(initial=0.0) > RULES.same_place:
         joint = model.names[1 + int(np.argmax(apart))]
         raise RobotError(f"{path} places joint '{joint}' elsewhere, expected the robot file that the chart was made of")
-    # Frames of our tree have the joint's axis as z; Pinocchio's have those of the file.
+    # Our body frames have the joint axis as z; Pinocchio's frames are those of the file.
     turns = [np.eye(3), *(rotate_z_to(find_axis(model, i)[1]) for i in range(1, model.njoints))]
     places = []
     for name in names:
@@ -337,7 +339,7 @@ def place_links(
 
 
 def load_mesh(path: Path, shape: ElementTree.Element) -> tuple[Array, Indices]:
-    """Vertices (V, 3) [m] and triangles (F, 3) of the mesh that a URDF file at `path` names, scaled.
+    """Vertices (V, 3) [m] and triangles (F, 3) of the scaled mesh that a URDF file at `path` names.
 
     Raises:
         ValueError: if it cannot be found or read, or has no triangle, or a vertex is not finite.
@@ -349,11 +351,11 @@ def load_mesh(path: Path, shape: ElementTree.Element) -> tuple[Array, Indices]:
 
 
 def find_mesh(path: Path, name: str) -> Path | None:
-    """The mesh file that a URDF file names: beside it, absolute, or in a package above it or on ROS_PACKAGE_PATH."""
+    """Find the mesh file that a URDF file names: beside it, absolute, or in a package above or on ROS_PACKAGE_PATH."""
     name = unquote(name)
     scheme, _, rest = name.rpartition("://")
     folder = path.resolve().parent
-    # Packages lie above the file, or where ROS looks for them.
+    # Packages lie above the file, or in the folders of ROS.
     if scheme in ("package", "model"):
         package, _, inside = rest.partition("/")
         roots = [*folder.parents, folder, *map(Path, filter(None, os.environ.get("ROS_PACKAGE_PATH", "").split(":")))]
@@ -374,7 +376,7 @@ def read_pose(element: ElementTree.Element) -> Any:
 
 
 def read_numbers(element: ElementTree.Element, name: str, count: int, default: tuple[float, ...]) -> Array:
-    """Numbers of an attribute; the default if it is missing or is not that many finite numbers."""
+    """Numbers of an attribute; the default if it is missing or does not hold `count` finite numbers."""
     try:
         values = np.array([float(word) for word in element.get(name, "").split()])
     except ValueError:
@@ -390,18 +392,18 @@ _ARRAYS = ("collisions_poses", "collisions_sizes", "collisions_points")
 
 @dataclass(frozen=True, eq=False)
 class KnownSolids:
-    """Solids that are there already, in place of files."""
+    """Solids in memory, in place of a file."""
 
     collisions: Collisions
     locked: Mapping[str, float] = field(default_factory=dict)
 
     def read(self, tree: KinematicTree) -> Collisions:
-        """The same on a robot with the same bodies."""
+        """The same solids on a robot with the same bodies."""
         known = self.collisions
         return Collisions(tree, known.parts, known.pairs, known.missing, known.origin)
 
 
-#: by their words in files: a geometry, how many sizes it has, and how it is made of these and of points
+#: words in files -> a geometry, its number of sizes, and a function of sizes and points that builds it
 _KINDS: Mapping[str, tuple[type, int, Callable[[Array, Array], Geometry]]] = {
     "box": (BoxGeometry, 3, lambda size, _: BoxGeometry(size)),
     "ball": (BallGeometry, 1, lambda size, _: BallGeometry(float(size[0]))),
@@ -415,8 +417,8 @@ _KINDS: Mapping[str, tuple[type, int, Callable[[Array, Array], Geometry]]] = {
 
 
 def collisions_to_data(collisions: Collisions) -> tuple[dict[str, Any], dict[str, Array]]:
-    """A collision model as plain data and arrays; of solids that a pair needs. Corners have single precision."""
-    # Solids that no pair names are never measured, so files need not carry them.
+    """A collision model as plain data and arrays, with the solids that a pair names; corners in single precision."""
+    # No distance to other solids is ever measured, so files need not store them.
     used = {name for pair in collisions.pairs for name in pair}
     parts, poses, sizes, points = list[dict[str, Any]](), list[Array](), list[float](), list[Array]()
     for part in collisions.parts:
@@ -424,7 +426,8 @@ def collisions_to_data(collisions: Collisions) -> tuple[dict[str, Any], dict[str
             continue
         geometry = part.shape.geometry
         kind = next(word for word, (own, _, _) in _KINDS.items() if isinstance(geometry, own))
-        # Its fields are sizes, but for the corners of a hull, whose faces follow from them, and the points of a cloud.
+        # All fields of a geometry are sizes, except the corners of a hull (from which its faces follow) and the points
+        # of a cloud.
         values = {part.name: getattr(geometry, part.name) for part in fields(geometry)}  # type: ignore[arg-type]
         corners = values.pop("points", np.zeros((0, 3)))
         values.pop("faces", None)
@@ -432,7 +435,7 @@ def collisions_to_data(collisions: Collisions) -> tuple[dict[str, Any], dict[str
         poses.append(np.column_stack([part.shape.rotation, part.shape.translation]))
         sizes += [float(value) for size in values.values() for value in np.ravel(size)]
         points.append(corners)
-    # Pairs as numbers of names: several parts of a link share its name.
+    # Store pairs as indices of names. Several parts of a link share its name.
     names = list(dict.fromkeys(part["name"] for part in parts))
     header = {
         "parts": parts,
@@ -440,20 +443,20 @@ def collisions_to_data(collisions: Collisions) -> tuple[dict[str, Any], dict[str
         "missing": list(collisions.missing),
         "origin": collisions.origin,
     }
-    # Corners are most of the bytes; a float32 of a metre is off by less than a tenth of a micrometre.
+    # Corners are most of the bytes. In single precision an error at 1 m is below 0.1 micrometre.
     corners = np.concatenate([np.zeros((0, 3)), *points]).astype(np.float32)
     arrays = (np.array(poses).reshape(-1, 3, 4), np.array(sizes, dtype=float), corners)
     return header, dict(zip(_ARRAYS, arrays, strict=True))
 
 
 def collisions_from_data(tree: KinematicTree, data: Mapping[str, Any], arrays: Mapping[str, Any]) -> Collisions:
-    """The collision model of a robot of plain data and arrays that may be anything.
+    """The collision model of a robot from plain data and arrays, which may be damaged.
 
     Raises:
-        OrthocasError, and the errors that Python and NumPy have for damaged data: if they make no sense.
+        OrthocasError, and errors of Python and NumPy: if the data are damaged.
     """
     poses, sizes, points = (np.asarray(get_part(arrays, name, np.ndarray), dtype=float) for name in _ARRAYS)
-    # Nothing is trusted: a file may have been edited.
+    # Check everything, because a file may have been edited.
     for name, array in zip(_ARRAYS, (poses, sizes, points), strict=True):
         if not (np.abs(array) <= RULES.largest).all():
             raise InvalidValueError(name, "numbers that are not finite or too large", f"at most {RULES.largest:g}")
@@ -468,12 +471,12 @@ def collisions_from_data(tree: KinematicTree, data: Mapping[str, Any], arrays: M
         count = get_part(description, "points", int)
         corners = points[point : point + count]
         if count < 0 or len(own) != length or len(corners) != count:
-            raise InvalidValueError("solids", f"fewer numbers than a {kind} has", "as many")
+            raise InvalidValueError("solids", f"too few numbers for a {kind}", "all of its sizes and corners")
         size, point = size + len(own), point + count
-        # A scaled or mirrored pose would change distances without a word.
+        # A scaled or mirrored pose would change distances without an error.
         R = pose[:, :3]
         if np.abs(R.T @ R - np.eye(3)).max() > RULES.straight:
-            raise InvalidValueError("collisions_poses", R.tolist(), "rotations")
+            raise InvalidValueError("collisions_poses", R.tolist(), "rotation matrices")
         shape = Shape(build(own, corners), R, pose[:, 3])
         parts.append(Part(get_part(description, "name", str), get_part(description, "body", int), shape))
     names = list(dict.fromkeys(part.name for part in parts))

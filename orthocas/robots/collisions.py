@@ -1,4 +1,4 @@
-"""Distances between the links of a robot, and from a scene, by coal: least distance, its gradient, and checked ways."""
+"""Distances between the links of a robot and to a scene, by coal: least distance, gradient, and checks of motions."""
 
 from __future__ import annotations
 
@@ -45,16 +45,16 @@ Pair = tuple[str, str]  #: names of two links, or of a link and an object of the
 class CollisionRules:
     """Numbers of collision checks."""
 
-    tolerance: float = 1e-10  #: of distances of separate solids, relative to them; overlaps keep coal's 1e-6
-    iterations: int = 1000  #: of the search for them
-    deepening: int = 255  #: of the search for depths of overlaps; 64 leave 1e-5 m between round solids
-    piece: int = 256  #: postures whose bounds are computed at once
-    first: int = 24  #: pairs with the nearest balls, of which bounds by capsules are computed first
-    slack: float = 2e-6  #: of lower bounds [m]
-    same_place: float = 1e-6  #: between the joints of two robots [m]
-    parallel: float = 1e-12  #: of the squared sine between two axes
-    longest: float = 100.0  #: [rad] or [m], of a joint on the way between two postures
-    resolution: float = 1e-6  #: [m]: closer pairs count as touching while a way between postures is checked
+    tolerance: float = 1e-10  #: relative tolerance of distances between separate solids; overlaps keep coal's 1e-6
+    iterations: int = 1000  #: largest number of iterations of coal's distance search
+    deepening: int = 255  #: iterations for the depth of overlaps; 64 leave an error of 1e-5 m between round solids
+    piece: int = 256  #: postures per batch of bounds
+    first: int = 24  #: number of pairs, by nearest balls, whose bounds by capsules are computed first
+    slack: float = 2e-6  #: subtracted from lower bounds [m]
+    same_place: float = 1e-6  #: [m], largest distance of equal joints of two robots
+    parallel: float = 1e-12  #: squared sine of an angle below which axes count as parallel
+    longest: float = 100.0  #: [rad] or [m], largest step of a joint between two postures
+    resolution: float = 1e-6  #: [m]; closer pairs count as touching when motions are checked
 
 
 RULES = CollisionRules()
@@ -73,9 +73,9 @@ class Part:
 class LeastDistance(Shown):
     """The least distance over all pairs at one posture, or at N postures; see `Collisions.distance`."""
 
-    distance: Any  #: [m], a number or (N,); negative: how deep the pair overlaps
+    distance: Any  #: [m], a number or (N,); negative: depth of the overlap
     pair: Any  #: names of the nearest pair, or a list of N
-    points: Array  #: the nearest points of the two in the world, (2, 3) or (N, 2, 3) [m]
+    points: Array  #: nearest points of the two solids in the world, (2, 3) or (N, 2, 3) [m]
     gradient: Array  #: d distance / dq, (n,) or (N, n) [m/rad] or [m/m]
 
     def facts(self) -> dict[str, str]:
@@ -93,40 +93,40 @@ class LeastDistance(Shown):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class NearPairs(Shown):
-    """Pairs that are near at one posture, the nearest first; see `Collisions.find_near`."""
+    """Pairs that are near each other at one posture, nearest first; see `Collisions.find_near`."""
 
     pairs: tuple[Pair, ...]  #: names
-    distance: Array  #: (P,) [m], negative: how deep they overlap
+    distance: Array  #: (P,) [m]; negative: depth of the overlap
     gradient: Array  #: d distance / dq, (P, n) [m/rad] or [m/m]
     points: Array  #: nearest points in the world, (P, 2, 3) [m]
 
     def facts(self) -> dict[str, str]:
-        """The nearest ones."""
+        """The nearest pairs."""
         near = [f"{_name_pair(pair)} {value:.4g} m" for pair, value in zip(self.pairs, self.distance, strict=True)]
         return {"near": listed(near) or "no pair"}
 
 
 @dataclass(frozen=True, eq=False)
 class Contact:
-    """Where a way between postures cannot be shown to be free."""
+    """Where a straight motion between postures cannot be shown to be free of contacts."""
 
-    segment: int  #: it lies between this posture and the next one
+    segment: int  #: the contact lies between this posture and the next one
     fraction: float  #: of the way between them
     pair: Pair
     distance: float  #: of the pair there [m]
 
 
 class Collisions(Shown):
-    """What links of a robot, and objects around them, may hit.
+    """Collision model: solids of a robot's links and of objects around it, and the pairs to check.
 
-    `robot.collisions` reads it from the <collision> elements of the robot's URDF file: boxes, cylinders and spheres as
-    they are, meshes as their convex hulls. Distances are those of coal, for all pairs of `pairs`.
+    `robot.collisions` reads it from the <collision> elements of the robot's URDF file. Boxes, cylinders and spheres
+    keep their shapes, meshes become their convex hulls. The library coal computes the distances of all `pairs`.
 
     Args:
         tree: the robot's kinematics.
         parts: the solids.
-        pairs: names of the two links or objects of each pair that is checked.
-        missing: names of links whose mesh cannot be found or read: nothing is known of them.
+        pairs: the two names (links or objects) of each pair to check.
+        missing: names of links whose mesh cannot be found or read, so that they are not checked.
         origin: where the pairs come from, in a few words.
 
     Example:
@@ -152,18 +152,22 @@ class Collisions(Shown):
         require_kind("missing", missing, Sequence)
         self.tree = tree
         self.parts = tuple(parts)
-        self.missing = tuple(missing)  #: names of links with a mesh that cannot be found or read
+        self.missing = tuple(missing)  #: links whose mesh cannot be found or read
         self.origin = require_text("origin", origin)
         self.pairs = _check_pairs("pairs", pairs, [part.name for part in parts])  #: checked pairs, by names
-        # coal measures no distance between an ellipsoid and a cloud.
+        # coal cannot measure the distance of an ellipsoid from a point cloud.
         shut = {part.name for part in parts if not part.shape.geometry.knows_clouds}
         clouds = {part.name for part in parts if part.shape.geometry.reported_first}
         for pair in self.pairs if shut and clouds else ():
             if set(pair) & shut and set(pair) & clouds:
-                raise InvalidValueError("pairs", _name_pair(pair), "no ellipsoid with a point cloud: see `allowed`")
+                raise InvalidValueError(
+                    "pairs",
+                    _name_pair(pair),
+                    "pairs without an ellipsoid and a point cloud: list this one in `allowed`",
+                )
 
     def facts(self) -> dict[str, str]:
-        """Links, pairs, and what is unchecked."""
+        """Links, pairs, and what is not checked."""
         names = list(dict.fromkeys(part.name for part in self.parts))
         return {
             "collisions": f"{len(self.pairs)} pairs of {len(names)} links and objects, {self.origin}",
@@ -199,7 +203,7 @@ class Collisions(Shown):
         scratch = self._scratch
         for row, position in zip(values, points, strict=True):
             scratch.place(position)
-            # Of all parts of a pair, the least distance; bounds save nothing where every distance is asked for.
+            # A pair's distance is the least one of its parts. Bounds save nothing when every distance is needed.
             for k, owner in enumerate(self._owners.tolist()):
                 found = scratch.measure(k).min_distance
                 row[owner] = min(row[owner], found)
@@ -210,7 +214,8 @@ class Collisions(Shown):
         points, single = as_point_set("q", q, self.tree.n)
         free = np.ones(len(points), dtype=bool)
         scratch = self._scratch
-        # Postures whose lower bounds are all above zero are free without a call of coal; of others, likely pairs first.
+        # A posture is free if all lower bounds are above zero. Otherwise coal measures the pairs, the most likely
+        # contacts first.
         for start in range(0, len(points), RULES.piece):
             some = points[start : start + RULES.piece]
             bounds = self._bound_distances(some, 0.0)
@@ -224,19 +229,19 @@ class Collisions(Shown):
         return bool(free[0]) if single else free
 
     def find_near(self, q: ArrayLike, within: float) -> NearPairs:
-        """The pairs nearer than a distance at one posture, each with its gradient: rows of a program or a barrier.
+        """The pairs nearer than a distance at one posture, with their gradients: constraints for an optimiser.
 
         Args:
             q: (n,) [rad] or [m].
             within: [m].
 
         Raises:
-            ShapeError, InvalidValueError: if q is no posture of the robot, or `within` no number.
+            ShapeError, InvalidValueError: if q is not a posture of the robot, or `within` is not a number.
         """
         point, limit = as_point("q", q, self.tree.n), as_number("within", within)
         index = self.list_near_parts(point, limit)
         values, gradients, ends = self.measure_parts(point, index)
-        # Of several parts of a pair, the nearest one.
+        # A pair of several parts is listed once, with its nearest parts.
         order = [int(k) for k in np.argsort(values, kind="stable") if values[k] < limit]
         names = [self.pairs[self._owners[index[k]]] for k in order]
         kept: dict[Pair, int] = {}
@@ -246,20 +251,20 @@ class Collisions(Shown):
         return NearPairs(tuple(kept), values[rows], gradients[rows], ends[rows])
 
     def find_contact(self, q: ArrayLike, clearance: float = 0.0, bend: ArrayLike = 0.0) -> Contact | None:
-        """The first place on straight ways between postures where a pair may be nearer than a clearance.
+        """The first place on straight motions between postures where a pair may be nearer than a clearance.
 
-        Between two postures, no pair can get nearer than (d1 + d2 - L . |dq|) / 2, where L bounds how fast a turn or
-        move of each joint moves the two against each other. Ways where this does not suffice are halved (conservative
-        advancement), until a pair is nearer at a posture, or the bound is below the clearance by less than 1e-6 m.
-        So a way without a contact is free everywhere, not only at its postures.
+        Between two postures, a pair cannot get nearer than (d1 + d2 - L . |dq|) / 2, where L bounds how fast each joint
+        moves the two solids against each other. A motion for which this bound is too small is halved (conservative
+        advancement), until a pair is too near at a posture, or the bound is less than 1e-6 m below the clearance. So a
+        motion without a contact is free everywhere, not only at its postures.
 
         Args:
-            q: postures (N, n), with straight ways in joint space between them.
-            clearance: smallest distance to allow [m].
-            bend: how far the true way may be from the straight one, (n,) or one number [rad] or [m].
+            q: postures (N, n), joined by straight lines in joint space.
+            clearance: smallest allowed distance [m].
+            bend: largest deviation of the true motion from the straight one, (n,) or one number [rad] or [m].
 
         Returns:
-            The contact, or None if the way is free.
+            The contact, or None if the motion is free.
 
         Raises:
             ShapeError, InvalidValueError: if an argument is invalid, or a joint moves by over 100 rad or m at once.
@@ -268,14 +273,18 @@ class Collisions(Shown):
         gap = as_number("clearance", clearance)
         away = as_float_array("bend", bend)
         if away.shape not in ((), (self.tree.n,)) or not (away >= 0).all():
-            raise InvalidValueError("bend", away.tolist(), f"one length >= 0, or {self.tree.n}")
+            raise InvalidValueError("bend", away.tolist(), f"one number >= 0, or {self.tree.n} of them")
         extra = self.rates @ np.broadcast_to(away, (self.tree.n,))
         if not self._owners.size or not len(points):
             return None
-        # Longer ways would be halved too often.
+        # Longer steps would be halved too often.
         if np.abs(np.diff(points, axis=0)).max(initial=0.0) > RULES.longest:
-            raise InvalidValueError("q", "two postures farther apart", f"ways of at most {RULES.longest:g} rad or m")
-        # Balls around the parts first, over many ways at once; a single posture is a way without a move.
+            raise InvalidValueError(
+                "q",
+                "too long a step between two postures",
+                f"steps of at most {RULES.longest:g} rad or m in each joint",
+            )
+        # First compare balls around the parts, for many steps at once. A single posture is a step of length zero.
         for start in range(0, max(len(points) - 1, 1), RULES.piece):
             some = points[start : start + RULES.piece + 1]
             later = slice(1, None) if len(some) > 1 else slice(None)
@@ -286,7 +295,8 @@ class Collisions(Shown):
             def find_room(bounds: Array = bounds, loss: Array = loss, later: slice = later) -> Array:
                 return np.asarray((bounds[: len(loss)] + bounds[later]) / 2 - loss)
 
-            # Capsules at both ends of ways where balls leave no room; what still lacks it is halved.
+            # Where balls are too close, compare capsules at both ends of the step. Halve the steps that are still too
+            # close.
             rows, pairs = np.nonzero(find_room() <= gap)
             near = np.zeros(bounds.shape, dtype=bool)
             near[rows, pairs] = near[np.minimum(rows + 1, len(some) - 1), pairs] = True
@@ -300,7 +310,7 @@ class Collisions(Shown):
         return None
 
     def with_scene(self, scene: Scene, allowed: Sequence[Pair] = ()) -> Collisions:
-        """The same with objects around the robot: every link that moves is checked against every object.
+        """The same model with objects around the robot. Every moving link is checked against every object.
 
         Args:
             scene: the objects, in the frame of the world.
@@ -313,13 +323,13 @@ class Collisions(Shown):
         return self._add([Part(name, -1, solid.shape) for name, solid in scene.solids.items()], allowed)
 
     def with_attached(self, frame: str, solids: Mapping[str, Solid], allowed: Sequence[Pair] = ()) -> Collisions:
-        """The same with solids that a link carries, such as a tool or a box in the hand.
+        """The same model with solids that a link carries, such as a tool or a box in the hand.
 
-        They are checked against all links and objects but those of the same body.
+        They are checked against all links and objects except those on the same body.
 
         Args:
             frame: name of the link, or of another frame that the robot knows.
-            solids: by name, in that frame.
+            solids: solids by name, placed in that frame.
             allowed: further pairs that may touch, by names.
 
         Raises:
@@ -327,10 +337,12 @@ class Collisions(Shown):
             InvalidValueError: if a name is taken.
         """
         carrier = self.tree.frame(frame)
-        # Half-spaces have no end that a joint could move.
+        # A half-space is infinite, so a link cannot carry it.
         for name, solid in Scene(solids).solids.items():
             if not solid.shape.bounded:
-                raise InvalidValueError(f"solid '{name}'", solid.heading, "one with an end, which a link can carry")
+                raise InvalidValueError(
+                    f"solid '{name}'", solid.heading, "a bounded solid: a link cannot carry a half-space"
+                )
         shapes = {name: solid.shape for name, solid in Scene(solids).solids.items()}
         return self._add(
             [
@@ -341,8 +353,8 @@ class Collisions(Shown):
         )
 
     def _add(self, parts: Sequence[Part], allowed: Sequence[Pair]) -> Collisions:
-        """The same with further parts, checked against all that are there and of another body."""
-        # Old against old is checked already, and parts of one body never move against each other.
+        """The same model with further parts, each checked against all existing parts of other bodies."""
+        # Pairs of existing parts are checked already, and parts of one body never move against each other.
         bodies = {part.name: part.body for part in self.parts}
         both = [*bodies, *(part.name for part in parts)]
         touching = {frozenset(pair) for pair in _check_pairs("allowed", allowed, both)}
@@ -363,7 +375,7 @@ class Collisions(Shown):
         Args:
             points: the postures.
             least: the distance [m].
-            asked: whether a pair is asked for, (pairs,).
+            asked: (pairs,), whether to check each pair.
         """
         scratch = self._scratch
         bounds = self._bound_distances(points, least)
@@ -378,15 +390,15 @@ class Collisions(Shown):
             yield from ((owner, found) for owner, found in distances.items() if found < least)
 
     def measure_nearest(self, points: Array, count: int) -> tuple[Array, Array]:
-        """Distances (N, k) and gradients (N, k, n) at postures (N, n), of `count` pairs of parts, or of all if fewer.
+        """Distances (N, k) and gradients (N, k, n) of the `count` nearest pairs of parts at postures (N, n).
 
-        They are those whose capsules are nearest, of the pairs with the nearest balls.
+        They are chosen by the distances of their capsules, among the pairs with the nearest balls.
         """
         N, most = len(points), len(self._owners)
         k = min(count, most)
         if not k or not N:
             return np.zeros((N, 0)), np.zeros((N, 0, self.tree.n))
-        # Ball bounds for all pairs, capsule bounds for the first of them, coal for the k nearest of these.
+        # Bound all pairs by balls, the nearest of them by capsules, and measure the k nearest of these with coal.
         bounds, capsules = self._bound_by_balls(points)
         first = min(RULES.first, most)
         chosen = np.argpartition(bounds, first - 1, axis=1)[:, :first]
@@ -398,11 +410,11 @@ class Collisions(Shown):
         return np.array([row[0] for row in measured]), np.array([row[1] for row in measured])
 
     def list_near_parts(self, q: Array, within: float | Array) -> Indices:
-        """Indices of pairs of parts whose lower bounds at q (n,) are below a distance, one for all or each, (K,)."""
+        """Indices (K,) of pairs of parts whose lower bounds at q (n,) are below a distance (a number, or one each)."""
         return np.flatnonzero(self._bound_distances(q[None], within)[0] < within)
 
     def measure_parts(self, q: Array, index: Indices) -> tuple[Array, Array, Array]:
-        """Distances (P,), gradients (P, n) and nearest points (P, 2, 3) of numbered pairs of parts (P,) at q (n,)."""
+        """Distances (P,), gradients (P, n), nearest points (P, 2, 3) of the pairs of parts `index` (P,), at q (n,)."""
         scratch = self._scratch
         scratch.place(q)
         values, ends, normals = np.empty(len(index)), np.empty((len(index), 2, 3)), np.empty((len(index), 3))
@@ -410,14 +422,14 @@ class Collisions(Shown):
             result = scratch.measure(k)
             values[row], normals[row] = result.min_distance, result.normal
             ends[row, 0], ends[row, 1] = result.getNearestPoint1(), result.getNearestPoint2()
-        # Of point clouds, coal has the cloud first.
+        # coal reports the cloud first in pairs with a point cloud.
         swapped = self._swapped[index]
         ends[swapped], normals[swapped] = ends[swapped, ::-1], -normals[swapped]
         gradients = self._build_gradients(np.broadcast_to(q, (len(index), len(q))), index, ends, normals)
         return values, gradients, ends
 
     def require_for(self, tree: KinematicTree) -> None:
-        """Raise InvalidValueError unless the robot is the one of another tree."""
+        """Raise InvalidValueError unless the model belongs to the robot of another tree."""
         mine = self.tree
         same = mine.joint_names == tree.joint_names and np.allclose(
             mine.translations, tree.translations, rtol=0.0, atol=RULES.same_place
@@ -429,18 +441,18 @@ class Collisions(Shown):
 
     @cached_property
     def rates(self) -> Array:
-        """How fast joints move the two of each pair of parts against each other, (K, n) [m/rad] or [m/m].
+        """Largest speed of the two parts of each pair against each other, per joint speed, (K, n) [m/rad] or [m/m].
 
-        A joint that carries one of the two turns it about its axis, so no point of it moves faster than its largest
-        distance from that axis, over all postures between the limits.
+        A joint that carries one of the two parts turns it about its axis. So no point of the part moves faster than its
+        largest distance from that axis, over all postures between the limits.
         """
         tree, parts = self.tree, self.parts
         reach = np.zeros((len(parts), tree.bodies))
-        # How far the joints of slides go, those of mimic joints too.
+        # Largest displacements of sliding joints, including mimic joints.
         strokes = np.maximum(*(np.abs(tree.expand(end)) for end in (tree.lower, tree.upper)))
         for k, part in enumerate(parts):
             start, end, radius = part.shape.bound()
-            # From the farthest point of the part inwards, along the joints that carry it.
+            # Go from the farthest point of the part towards the base, along the joints that carry it.
             length = max(float(np.linalg.norm(start)), float(np.linalg.norm(end))) + radius
             across = max(float(np.hypot(*start[:2])), float(np.hypot(*end[:2]))) + radius
             body = part.body
@@ -456,13 +468,13 @@ class Collisions(Shown):
         return np.where(moves, reach[first] + reach[second], 0.0) @ np.abs(tree.coupling)
 
     def _halve(self, a: Array, b: Array, suspects: Indices, gap: float, extra: Array) -> Contact | None:
-        """The first contact on the straight way from a to b (n,), of some pairs; None if it is free."""
+        """The first contact of some pairs on the straight motion from a to b (n,); None if it is free."""
         waiting = [(0.0, 1.0, suspects)]
         known: dict[float, Array] = {}
         whole = self.rates @ np.abs(b - a)
 
         def measure(s: float, pairs: Indices) -> Array:
-            """Distances at a fraction of the way, NaN for pairs that are not asked for."""
+            """Distances of pairs at a fraction of the motion."""
             values = known.setdefault(s, np.full(len(self._owners), np.nan))
             scratch = self._scratch
             scratch.place(a + s * (b - a))
@@ -480,7 +492,7 @@ class Collisions(Shown):
             if (high - low) * whole[pairs[near]].max() < RULES.resolution:
                 k = near[np.argmin(room[near])]
                 return Contact(0, low, self.pairs[self._owners[pairs[k]]], float(min(first[k], second[k])))
-            # The earlier half comes first.
+            # Check the earlier half first.
             middle = (low + high) / 2
             waiting += [(middle, high, pairs[near]), (low, middle, pairs[near])]
         return None
@@ -488,8 +500,8 @@ class Collisions(Shown):
     def _find_least(self, points: Array) -> tuple[Array, Indices, Array, Array]:
         """Least distances (N,), pairs of parts (N,), nearest points (N, 2, 3) and normals (N, 3).
 
-        Pairs of parts are evaluated in the order of their lower bounds, until the next bound is above the least one.
-        The bounds are those of capsules for the pairs whose balls are nearest, and for others where these may matter.
+        Pairs of parts are measured in the order of their lower bounds, until the next bound is above the least
+        distance. Capsules bound the pairs whose balls are nearest, and later the others that may still be nearest.
         """
         N = len(points)
         found = np.full(N, np.inf), np.full(N, -1), np.full((N, 2, 3), np.nan), np.zeros((N, 3))
@@ -504,13 +516,13 @@ class Collisions(Shown):
             self._refine_bounds(bounds, capsules, own, chosen.ravel())
             orders = np.take_along_axis(chosen, np.argsort(np.take_along_axis(bounds, chosen, axis=1), axis=1), axis=1)
             self._evaluate_rows(points, rows, orders, bounds, found)
-            # The other pairs, where balls are nearer than what was found.
+            # Then the other pairs whose balls are nearer than the least distance so far.
             bounds[own, chosen.ravel()] = np.inf
             self._refine_bounds(bounds, capsules, *np.nonzero(bounds < found[0][rows, None]))
             left = np.flatnonzero((bounds < found[0][rows, None]).any(axis=1))
             self._evaluate_rows(points, rows[left], np.argsort(bounds[left], axis=1), bounds[left], found)
         values, index, ends, normals = found
-        # Of point clouds, coal has the cloud first.
+        # coal reports the cloud first in pairs with a point cloud.
         swapped = np.flatnonzero(self._swapped[index])
         ends[swapped], normals[swapped] = ends[swapped, ::-1], -normals[swapped]
         return values, index, ends, normals
@@ -518,14 +530,14 @@ class Collisions(Shown):
     def _evaluate_rows(
         self, points: Array, rows: Indices, orders: Indices, bounds: Array, found: tuple[Array, Indices, Array, Array]
     ) -> None:
-        """Evaluate pairs at R of the points (N, n), in orders (R, k), until bounds (R, K) are above what is found."""
+        """Measure pairs in orders (R, k) at rows (R,) of the points, until bounds exceed the least distance found."""
         values, index, ends, normals = found
         scratch = self._scratch
         sorted_bounds = np.take_along_axis(bounds, orders, axis=1).tolist()
         for row, order, own in zip(rows.tolist(), orders.tolist(), sorted_bounds, strict=True):
             scratch.place(points[row])
             least, nearest = values[row], -1
-            # Bounds ascend, so the first one above the least distance ends the search.
+            # Bounds ascend, so the search ends at the first one above the least distance.
             for bound, k in zip(own, order, strict=True):
                 if bound >= least:
                     break
@@ -543,7 +555,7 @@ class Collisions(Shown):
         gradients = np.zeros((N, n))
         if not self._owners.size or not N:
             return gradients
-        # u . (a x (p - o)) = a . (p x u) - (a x o) . u for turns about an axis a through o, and u . a for slides.
+        # For an axis a through o, u . (a x (p - o)) = a . (p x u) - (a x o) . u if it turns, and u . a if it slides.
         same = points.strides[0] == 0
         twists = self._twists(points[:1] if same else points)[0].reshape(-1, n, 6)
         for side, sign in ((0, -1.0), (1, 1.0)):
@@ -561,7 +573,7 @@ class Collisions(Shown):
         return bounds
 
     def _bound_by_balls(self, points: Array) -> tuple[Array, Array]:
-        """Lower bounds (N, K), those of balls around the parts, and the ends of their capsules (N, parts, 2, 3)."""
+        """Lower bounds (N, K) by balls around the parts, and the ends (N, parts, 2, 3) of the parts' capsules."""
         N = len(points)
         places = self._places(points)[0].reshape(N, len(self.parts), 3, 3)
         centres = places[:, :, 2]
@@ -572,14 +584,14 @@ class Collisions(Shown):
         apart = squares[:, first] + squares[:, second] - 2 * products[:, first, second]
         bounds = np.sqrt(np.maximum(apart, 0.0)) - (self._ball_radii[first] + self._ball_radii[second] + RULES.slack)
         for k in np.flatnonzero(~self._bounded[second]):
-            # A half-space: the nearer end of the capsule.
+            # The distance from a half-space is that of the capsule's nearer end.
             shape = self.parts[second[k]].shape
             heights = (places[:, first[k], :2] - shape.translation) @ shape.rotation[:, 2]
             bounds[:, k] = heights.min(axis=1) - self._radii[first[k]] - RULES.slack
         return bounds, places[:, :, :2]
 
     def _refine_bounds(self, bounds: Array, ends: Array, rows: Indices, pairs: Indices) -> None:
-        """Put the bounds of capsules in the place of those of balls, at numbers of postures and pairs, (M,) each."""
+        """Replace bounds by balls with bounds by capsules, for given postures `rows` (M,) and `pairs` (M,)."""
         kept = self._bounded[self._pair_parts[pairs, 1]]
         rows, pairs = rows[kept], pairs[kept]
         first, second = self._pair_parts[pairs].T
@@ -603,7 +615,7 @@ class Collisions(Shown):
         carriers: dict[str, list[int]] = {}
         for k, part in enumerate(self.parts):
             carriers.setdefault(part.name, []).append(k)
-        # A link of several parts has a row for each of them with each part of the other link.
+        # Every part of a link is paired with every part of the other link.
         rows = [
             (i, k, owner)
             for owner, (first, second) in enumerate(self.pairs)
@@ -615,7 +627,7 @@ class Collisions(Shown):
 
     @cached_property
     def _swapped(self) -> Array:
-        """Whether coal reports the second part of a pair of parts as the first one, (K,)."""
+        """Whether coal reports the two parts of a pair in reverse order, (K,)."""
         return np.array([self.parts[k].shape.geometry.reported_first for k in self._pair_parts[:, 1]], dtype=bool)
 
     @cached_property
@@ -628,7 +640,7 @@ class Collisions(Shown):
 
     @cached_property
     def _carried(self) -> Array:
-        """Whether a joint carries a part, (parts, n)."""
+        """Whether each joint carries each part, (parts, n)."""
         carried = np.zeros((len(self.parts), self.tree.bodies))
         for row, part in zip(carried, self.parts, strict=True):
             row[self.tree.carriers(part.body)] = 1.0
@@ -648,7 +660,7 @@ class Collisions(Shown):
 
     @cached_property
     def _balls(self) -> list[tuple[Array, float]]:
-        """Centres in the frames of the bodies, and radii, of balls around all parts."""
+        """Balls around all parts: centres in the frames of the bodies, and radii."""
         return [part.shape.bound_by_ball() for part in self.parts]
 
     @cached_property
@@ -657,7 +669,7 @@ class Collisions(Shown):
 
     @cached_property
     def _twists(self) -> Batched:
-        """q -> of every joint a and a x o, with its axis a through o in the world; 0 and -a of slides, (6 N, 1)."""
+        """q -> axis a, and a x o for a point o of the axis in the world, of all joints (0, -a of slides), (6 N, 1)."""
         q = ca.SX.sym("q", self.tree.n)
         rows = []
         for kind, (rotation, translation) in zip(self.tree.body_kinds, build_body_poses(self.tree, q), strict=True):
@@ -669,7 +681,7 @@ class Collisions(Shown):
     def _models(self) -> tuple[pin.Model, pin.GeometryModel]:
         """The robot and its solids for Pinocchio."""
         tree, model, geometry = self.tree, pin.Model(), pin.GeometryModel()
-        # All joints are independent ones, parents first; `place` gives them their positions.
+        # Pinocchio gets all joints as independent ones, parents first. `place` computes their positions.
         ids = {-1: 0}
         for i in tree.order:
             joint = pin.JointModelPZ() if tree.body_kinds[i] == "prismatic" else pin.JointModelRZ()
@@ -689,7 +701,7 @@ class Collisions(Shown):
 
     @property
     def _scratch(self) -> _Scratch:
-        """The models, with the memory of one thread."""
+        """The models and the working memory of one thread."""
         mine = self._threads
         if not hasattr(mine, "scratch"):
             mine.scratch = _Scratch(self.tree, *self._models)
@@ -698,7 +710,7 @@ class Collisions(Shown):
 
 
 class _Scratch:
-    """Models of Pinocchio, and the data of one thread."""
+    """Pinocchio's models, and working memory for one thread."""
 
     def __init__(self, tree: KinematicTree, model: pin.Model, geometry: pin.GeometryModel) -> None:
         self.model, self.geometry = model, geometry
@@ -720,7 +732,7 @@ class _Scratch:
         pin.updateGeometryPlacements(self.model, self.data, self.geometry, self.placed, positions)
 
     def measure(self, k: int) -> Any:
-        """The distance of pair k as placed: each search begins alike, so that results do not depend on earlier ones."""
+        """Distance of pair k as placed. Every search starts alike, so that results do not depend on earlier ones."""
         request = self._requests[k]
         request.cached_gjk_guess, request.cached_support_func_guess = self._guess, self._corners
         return pin.computeDistance(self.geometry, self.placed, k)
@@ -733,11 +745,11 @@ def _cross(a: Array, b: Array) -> Array:
 
 
 def _measure_segments(a0: Array, a1: Array, b0: Array, b1: Array) -> Array:
-    """Squared distances of segments (..., 3), which may have no length."""
+    """Squared distances of segments (..., 3), which may have zero length."""
     a, b, between = a1 - a0, b1 - b0, a0 - b0
     aa, ab, bb = (np.einsum("...i,...i->...", u, v) for u, v in ((a, a), (a, b), (b, b)))
     ac, bc = (np.einsum("...i,...i->...", u, between) for u in (a, b))
-    # The nearest points of the lines, then each in turn on its segment; any point of the first if they are parallel.
+    # Take the nearest points of the two lines, then clip each to its segment. For parallel lines any point will do.
     volume = aa * bb - ab * ab
     s = np.where(volume > RULES.parallel * aa * bb, ab * bc - ac * bb, 0.0) / np.where(volume > 0, volume, 1.0)
     t = (ab * np.clip(s, 0.0, 1.0) + bc) / np.where(bb > 0, bb, 1.0)

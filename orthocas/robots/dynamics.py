@@ -15,12 +15,12 @@ from orthocas.robots.tree import KinematicTree
 from orthocas.tools.checks import Array, as_float_array, require_finite
 
 _Z = ca.SX([0, 0, 1])
-#: which of mass, mass times centre, and inertia xx, xy, xz, yy, yz, zz are not 0 after `_regroup`
+#: indices of the inertial parameters (mass, mass times centre, inertia xx, xy, xz, yy, yz, zz) that `_regroup` leaves
 _OF_BODY = {"revolute": [1, 2, 4, 5, 6, 8, 9], "prismatic": list(range(10))}
-PAYLOAD = 10  #: numbers of a payload
+PAYLOAD = 10  #: number of parameters of a payload
 _FORMS = "a mass, (4,) mass and centre, or (10,) mass, centre and inertia Ixx, Ixy, Ixz, Iyy, Iyz, Izz"
-_MATRIX = [0, 1, 2, 1, 3, 4, 2, 4, 5]  #: places of Ixx, Ixy, Ixz, Iyy, Iyz, Izz in the matrix
-_INDEFINITE = 1e-6  #: of the largest entry of a payload's inertia, as rounded ones of data sheets have
+_MATRIX = [0, 1, 2, 1, 3, 4, 2, 4, 5]  #: index of each entry of the 3 x 3 matrix in (Ixx, Ixy, Ixz, Iyy, Iyz, Izz)
+_INDEFINITE = 1e-6  #: allowed negative moment of a payload, relative to its largest one: data sheets round
 
 
 @dataclass
@@ -37,8 +37,8 @@ def build_mass_matrix(
 ) -> ca.SX:
     """M(q), (n, n), symmetric positive definite, [kg m^2] for revolute joints. The diagonal includes rotor inertias.
 
-    A payload (10, 1) is mass, centre in the tip frame, and inertia about it: Ixx, Ixy, Ixz, Iyy, Iyz, Izz. Inertials
-    are the numbers of `collect_inertials`, if they are not those of the tree.
+    A payload (10, 1) holds mass, centre in the tip frame, and inertia about the centre: Ixx, Ixy, Ixz, Iyy, Iyz, Izz.
+    `inertials` replaces the tree's parameters; see `collect_inertials`.
     """
     joints = _build_transforms(tree, q)
     bodies = _build_bodies(tree, payload, inertials)
@@ -79,18 +79,18 @@ def build_inverse_dynamics(
     inertials: ca.SX | None = None,
     gravity: Array | None = None,
 ) -> ca.SX:
-    """tau = M ddq + C dq + g, (n, 1) [N m] or [N]; a gravity acceleration (3,) takes the place of that of the tree."""
+    """tau = M ddq + C dq + g, (n, 1) [N m] or [N]; `gravity` (3,), if given, replaces that of the tree."""
     joints = _build_transforms(tree, q)
     bodies = _build_bodies(tree, payload, inertials)
-    # Mimic joints have the velocities S dq, and S^T of the torques of all joints acts on q.
+    # With mimic joints, all joints have velocities S dq, and the torques on q are S^T times those of all joints.
     S = ca.sparsify(ca.DM(tree.coupling))
     dq, ddq = (S @ dq, S @ ddq) if tree.mimic_names else (dq, ddq)
-    #: angular velocity, angular acceleration matrix, linear acceleration
+    #: angular velocity, U (below), and linear acceleration of each body
     states: dict[int, tuple[ca.SX, ca.SX, ca.SX]] = {}
     accelerations: dict[int, ca.SX] = {}
     at_rest = (ca.SX(3, 1), ca.SX(3, 3), constant(-(tree.gravity if gravity is None else gravity)))
     for i in tree.order:
-        # The parent's motion in the axes of the body, then what the joint adds.
+        # Express the parent's motion in the axes of the body, then add the joint's motion.
         omega_p, U_p, a_p = states.get(tree.parents[i], at_rest)
         alpha_p = accelerations.get(tree.parents[i], ca.SX(3, 1))
         to_child = joints[i].to_child
@@ -110,7 +110,7 @@ def build_inverse_dynamics(
 def build_forward_dynamics(
     tree: KinematicTree, q: ca.SX, dq: ca.SX, tau: ca.SX, inertials: ca.SX | None = None
 ) -> ca.SX:
-    """ddq = M^-1 (tau - C dq - g), (n, 1), with M = L^T D L, from the tips to the base.
+    """ddq = M^-1 (tau - C dq - g), (n, 1), with M = L^T D L factored from the tips to the base.
 
     In this order L keeps the zeros of M between joints of different branches ([F2008] Sec. 6.5).
     """
@@ -139,10 +139,10 @@ def build_gravity(tree: KinematicTree, q: ca.SX, payload: ca.SX | None = None) -
 
 
 def build_zero_momentum(tree: KinematicTree, q: ca.SX) -> ca.SX:
-    """H(q) = [-M_bb^-1 M_ba; I], (n, a), for a base b that floats and a joints of the arms."""
+    """H(q) = [-M_bb^-1 M_ba; I], (n, a), for the joints b of a floating base and the a joints of the arms."""
     k = len(tree.floating)
     M = build_mass_matrix(tree, q)
-    # L of L^T D L is in the order of `build_forward_dynamics`.
+    # Reversed, L^T D L has the order of `build_forward_dynamics`.
     base_first = list(reversed(range(k)))
     D, LT, order = ca.ldl(M[base_first, base_first], False)
     follows = ca.ldl_solve(M[base_first, k:], D, LT, order)[base_first, :]
@@ -161,7 +161,7 @@ def build_coriolis_product(tree: KinematicTree, q: ca.SX, v: ca.SX, w: ca.SX, pa
 
 @dataclass
 class _JointTransform:
-    """Body i in its parent's frame: a constant rotation and a turn about z, which are cheaper than their product."""
+    """Pose of body i in its parent's frame; a constant rotation and Rz(q) are kept apart, which saves operations."""
 
     rotation: ca.SX  #: constant, (3, 3)
     turn: ca.SX  #: Rz(q) or the identity
@@ -208,7 +208,7 @@ def _sum_wrenches(
     torques = [ca.SX(3, 1)] * tree.bodies
     tau = ca.SX.zeros(tree.bodies)
     for i in reversed(tree.order):
-        # The wrench of the body itself, and those of the bodies that it carries.
+        # Sum the wrench of the body itself and those of the bodies that it carries.
         omega, U, a = states[i]
         moment, inertia = bodies[i].moment, bodies[i].inertia
         force = forces[i] + bodies[i].mass * a + U @ moment
@@ -226,7 +226,7 @@ def _project_on_joint(tree: KinematicTree, i: int, force: ca.SX, torque: ca.SX) 
 
 
 def collect_inertials(tree: KinematicTree) -> Array:
-    """The inertial parameters on which the dynamics depend, (k,): 7 of each revolute joint's body, 10 of others."""
+    """The inertial parameters that affect the dynamics, (k,): 7 per body of a revolute joint, 10 per other body."""
     numbers = []
     for kind, body in zip(tree.body_kinds, _regroup(tree), strict=True):
         all_ten = np.concatenate([[body.mass], body.moment, body.inertia[np.triu_indices(3)]])
@@ -235,7 +235,7 @@ def collect_inertials(tree: KinematicTree) -> Array:
 
 
 def find_first_moments(tree: KinematicTree) -> tuple[list[int], tuple[int, ...]]:
-    """Indices in `collect_inertials` of the numbers on which gravity depends, and the joint that carries each.
+    """The parameters of `collect_inertials` that gravity acts on: their indices, and the joint of each.
 
     These are mass times centre across the axis for revolute joints, and the mass for prismatic ones.
     """
@@ -250,7 +250,7 @@ def find_first_moments(tree: KinematicTree) -> tuple[list[int], tuple[int, ...]]
 
 
 def _build_bodies(tree: KinematicTree, payload: ca.SX | None, inertials: ca.SX | None) -> list[_Body]:
-    """The regrouped bodies, of the tree or with the numbers of `collect_inertials`; a payload is on that of the tip."""
+    """The regrouped bodies, from the tree or from given parameters; a payload is added to the body of the tip."""
     if inertials is None:
         bodies = [_Body(ca.SX(b.mass), constant(b.moment), constant(b.inertia)) for b in _regroup(tree)]
     else:
@@ -261,7 +261,7 @@ def _build_bodies(tree: KinematicTree, payload: ca.SX | None, inertials: ca.SX |
                 ten[place], start = inertials[start], start + 1
             bodies.append(_Body(ten[0], ten[1:4], ca.reshape(ten[[4, 5, 6, 5, 7, 8, 6, 8, 9]], 3, 3)))
     if payload is not None and tree.tip_parent >= 0:
-        # Mass, mass times centre, and inertia about the body's origin, in the frame of the tip's body.
+        # Payload as mass, mass times centre, and inertia about the body's origin, in the frame of the tip's body.
         body, R, p, mass = (
             bodies[tree.tip_parent],
             constant(tree.tip_rotation),
@@ -276,12 +276,12 @@ def _build_bodies(tree: KinematicTree, payload: ca.SX | None, inertials: ca.SX |
 
 
 def _regroup(tree: KinematicTree) -> list[_Body]:
-    """Move inertial parameters from each body to its parent where this does not change the motion, to save operations.
+    """Move inertial parameters from each body to its parent where this leaves the motion unchanged, to save operations.
 
-    Mass, first moment along the axis, and the inertia of a rod along the axis do not change when the body turns about
-    that axis. So they can belong to the parent.
+    Turning a body about an axis changes neither its mass, nor its first moment along the axis, nor the inertia of a rod
+    along the axis. So these parameters can belong to the parent.
     """
-    # About the joint's frame in place of the centre of mass.
+    # Move the reference point from the centre of mass to the joint's frame.
     bodies = [
         _Body(mass, mass * centre, inertia + mass * (centre @ centre * np.eye(3) - np.outer(centre, centre)))
         for mass, centre, inertia in zip(tree.masses, tree.centres, tree.inertias, strict=True)
@@ -313,13 +313,13 @@ def check_payload(value: ArrayLike) -> Array:
             about that centre, in axes of the tip frame: Ixx, Ixy, Ixz, Iyy, Iyz, Izz [kg m^2].
 
     Raises:
-        InvalidValueError: for another form, a negative mass, or an inertia that no body has.
+        InvalidValueError: for another shape, a negative mass, or an inertia that is not positive semidefinite.
     """
     values = np.atleast_1d(as_float_array("payload", value))
     if values.shape not in ((1,), (4,), (PAYLOAD,)):
         raise InvalidValueError("shape of payload", values.shape, _FORMS)
     require_finite("payload", values)
-    # Missing numbers are 0: a point mass at the tip, or one elsewhere.
+    # Missing numbers are 0: a point mass, by default at the tip.
     numbers = np.zeros(PAYLOAD)
     numbers[: len(values)] = values
     if numbers[0] < 0:
@@ -341,7 +341,7 @@ def add_payload(tree: KinematicTree, payload: ArrayLike) -> KinematicTree:
         return tree
     R = tree.tip_rotation
     added = tree.tip_translation + R @ numbers[1:4]
-    # The joint centre of mass, and both inertias about it (Steiner).
+    # Combined centre of mass, and both inertias about it (Steiner).
     together = (mass * centre + numbers[0] * added) / total
     turned = R @ numbers[4:][_MATRIX].reshape(3, 3) @ R.T
     inertia = inertia + turned + _steiner(mass, centre - together) + _steiner(numbers[0], added - together)

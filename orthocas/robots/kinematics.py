@@ -1,4 +1,4 @@
-"""Forward kinematics of a tree as CasADi expressions, the tip's turn from a reference, and tools."""
+"""Forward kinematics of a tree as CasADi expressions, orientation of the tip relative to a reference, and tools."""
 
 from __future__ import annotations
 
@@ -27,14 +27,14 @@ from orthocas.robots.tree import Frame, KinematicTree
 from orthocas.tools.checks import Array, as_float_array, freeze_array, require_finite, require_known
 
 _AXES = ("x", "y", "z")
-_LEAST_SQUARE = 1e-24  #: of a cosine
-#: whether the position comes first, and whether the whole orientation counts
+_LEAST_SQUARE = 1e-24  #: smallest value under the square root of a cosine
+#: kind -> whether the position is included, and whether the whole orientation is
 _KINDS = {"orientation": (False, True), "pose": (True, True), "axis": (False, False), "position+axis": (True, False)}
 
 Pose = tuple[ca.SX, ca.SX]  #: rotation (3, 3) and position (3, 1) [m] in the world
 
 
-TOOL_SUFFIX = " + tool"  #: of the name of a tip at the end of a tool
+TOOL_SUFFIX = " + tool"  #: suffix of a tip's name with a tool
 
 
 def build_body_poses(tree: KinematicTree, q: ca.SX) -> list[Pose]:
@@ -58,7 +58,7 @@ def _move_to_child(tree: KinematicTree, positions: ca.SX, i: int, pose: Pose) ->
 def build_frame_pose(tree: KinematicTree, q: ca.SX, frame: Frame, base: Frame | None = None) -> Pose:
     """Rotation and position of a frame in the world, or in another frame, for q (n, 1).
 
-    Joints that carry both frames take no part.
+    Joints that carry both frames cancel and are left out.
     """
     shared = _find_shared(tree, frame, base)
     R, p = _place_frame(tree, q, frame, shared)
@@ -69,7 +69,7 @@ def build_frame_pose(tree: KinematicTree, q: ca.SX, frame: Frame, base: Frame | 
 
 
 def build_frame_jacobian(tree: KinematicTree, q: ca.SX, frame: Frame, base: Frame | None = None) -> ca.SX:
-    """Geometric Jacobian of a frame, (6, n), in axes of the world, or of another frame and as seen from it.
+    """Geometric Jacobian of a frame, (6, n), in world axes, or relative to another frame and in its axes.
 
     d(position)/dt = J[:3] dq, angular velocity = J[3:] dq.
     """
@@ -84,20 +84,20 @@ def build_frame_jacobian(tree: KinematicTree, q: ca.SX, frame: Frame, base: Fram
 
 
 def build_centre_of_mass(tree: KinematicTree, q: ca.SX) -> ca.SX:
-    """Centre of mass of all bodies that joints move, in the world, (3, 1)."""
+    """Centre of mass of all bodies that the joints move, in the world, (3, 1)."""
     places = [p + R @ constant(centre) for (R, p), centre in zip(build_body_poses(tree, q), tree.centres, strict=True)]
     total: ca.SX = sum(mass * place for mass, place in zip(tree.masses, places, strict=True)) / tree.masses.sum()
     return total
 
 
 def _find_shared(tree: KinematicTree, frame: Frame, base: Frame | None) -> list[int]:
-    """The bodies that carry two frames, from the base on; none if the second is the world."""
+    """The bodies that carry both frames, from the base on; none if the second frame is the world."""
     pairs = zip(tree.carriers(frame.parent), tree.carriers(-1 if base is None else base.parent), strict=False)
     return [body for body, other in pairs if body == other]
 
 
 def _place_frame(tree: KinematicTree, q: ca.SX, frame: Frame, shared: list[int]) -> Pose:
-    """Pose of a frame in the last of the shared bodies that carry it, or in the world."""
+    """Pose of a frame in the last one of the shared bodies, or in the world if there are none."""
     R, p = ca.SX.eye(3), ca.SX.zeros(3)
     positions = tree.expand(q)
     for body in tree.carriers(frame.parent)[len(shared) :]:
@@ -106,9 +106,9 @@ def _place_frame(tree: KinematicTree, q: ca.SX, frame: Frame, shared: list[int])
 
 
 def _build_jacobian(tree: KinematicTree, q: ca.SX, carrier: int, point: ca.SX, shared: list[int]) -> ca.SX:
-    """Jacobian (6, n) of a point and of the frames of a body, by the joints between it and the shared bodies."""
+    """Jacobian (6, n) of a point of a body, by the joints between the shared bodies and it."""
     J, pose, positions = ca.SX(6, tree.bodies), (ca.SX.eye(3), ca.SX.zeros(3)), tree.expand(q)
-    # A sliding joint moves the point along its axis, a turning one across the arm to the point.
+    # A sliding joint moves the point along its axis, a turning one along axis x (point - origin).
     for i in tree.carriers(carrier)[len(shared) :]:
         pose = _move_to_child(tree, positions, i, pose)
         axis = pose[0][:, 2]
@@ -135,16 +135,16 @@ def build_point_jacobian(tree: KinematicTree, q: ca.SX, body: int, point: Array)
 
 
 def build_joint_points(tree: KinematicTree, q: ca.SX) -> ca.SX:
-    """Base, origins of the joints that move the tip, and the tip, (3, points), in the world: a line to draw.
+    """Base, joint origins and tip as a line to draw, (3, points), in the world.
 
-    With further tips, the line goes to these first, and back along their joints.
+    With several tips, the line goes to the other tips first and returns along their joints.
     """
     poses, points = build_body_poses(tree, q), [ca.SX.zeros(3)]
     here: list[int] = []
     for name in (*reversed(tree.tips), tree.tip_name):
         frame = tree.frame(name)
         chain = tree.carriers(frame.parent)
-        # back along the last chain to where it left this one, then out to the tip
+        # Go back along the last chain to the branching point, then out to the next tip.
         back = [body for body in here if body not in chain]
         shared = len(here) - len(back)
         points += [poses[body][1] for body in [*reversed(back), *here[shared - 1 : shared]]]
@@ -156,11 +156,11 @@ def build_joint_points(tree: KinematicTree, q: ca.SX) -> ca.SX:
 
 @dataclass(frozen=True)
 class TipTurn:
-    """The tip's rotation from a reference. For pose-like tasks its position comes first."""
+    """Rotation of the tip relative to a reference; pose-like tasks put the position before it."""
 
     with_position: bool
     whole: bool  #: the whole orientation, or only the direction of one axis
-    axis: str | None = None  #: of the tip: "x", "y" or "z"; None for a rotation vector
+    axis: str | None = None  #: axis of the tip, "x", "y" or "z"; None for a rotation vector
 
     def __post_init__(self) -> None:
         if self.axis is not None:
@@ -168,7 +168,7 @@ class TipTurn:
 
     @classmethod
     def from_kind(cls, kind: str) -> Self | None:
-        """Build from a task's kind: orientation, pose:z, axis, axis:x, position+axis, .... None for other kinds."""
+        """Build from a task's kind, such as orientation, pose:z, axis:x or position+axis; None for other kinds."""
         what, _, axis = kind.partition(":")
         if what not in _KINDS:
             return None
@@ -195,12 +195,12 @@ class TipTurn:
         return tuple("m" if label in _AXES else "rad" for label in self.labels)
 
     def components(self, turned: ca.SX, position: ca.SX, to_differentiate: bool = False) -> ca.SX:
-        """The task value x, from the tip's rotation in the reference frame (3, 3) and its position (3, 1).
+        """The task value x, from the tip's rotation (3, 3) in the reference frame and its position (3, 1).
 
         Args:
             turned: the rotation.
             position: the position.
-            to_differentiate: use the formula without cases, which loses digits next to half a turn.
+            to_differentiate: use the formula without case distinctions, which loses digits near half a turn.
         """
         if self.axis is None:
             turns = half_angle_vector(turned) if to_differentiate else 2 * find_quaternion(turned)[1:]
@@ -209,21 +209,21 @@ class TipTurn:
         return ca.vertcat(position, turns) if self.with_position else turns
 
     def quaternion(self, turns: ca.SX) -> ca.SX:
-        """The rotation (w, x, y, z) that the components of a whole orientation (3, 1) describe, w >= 0 without axis."""
+        """Quaternion (w, x, y, z) of the components (3, 1) of a whole orientation; w >= 0 if no axis is chosen."""
         half = turns / 2
-        # a whole rotation vector
+        # Whole rotation vector.
         if self.axis is None:
             return ca.vertcat(_compute_cosine(half), half)
         axis = _AXES.index(self.axis)
         i, j = _others(axis)
         tilted, along, spun = ca.SX(3, 1), ca.SX(3, 1), ca.SX(3, 1)
-        # a tilt of the axis, then a turn about it
+        # Tilt of the axis, then turn about it.
         tilted[i], tilted[j], along[axis], spun[axis] = half[0], half[1], 1, ca.sin(half[2])
         tilting = ca.cross(along, tilted)
         return multiply_quaternions(ca.vertcat(_compute_cosine(tilting), tilting), ca.vertcat(ca.cos(half[2]), spun))
 
     def of_quaternion(self, p: ca.SX) -> ca.SX:
-        """The components of a whole orientation (3, 1) that a unit quaternion (w, x, y, z) describes."""
+        """Components (3, 1) of a whole orientation from its unit quaternion (w, x, y, z)."""
         if self.axis is None:
             return 2 * p[1:] * ca.if_else(p[0] < 0, -1, 1)
         cross = skew(p[1:])
@@ -232,7 +232,7 @@ class TipTurn:
 
     @property
     def order(self) -> Array:
-        """S (3, 3): S omega is how fast the components of a whole orientation change, as the rows of `rates`."""
+        """S (3, 3): the components of a whole orientation change at the rate S omega, in the order of `rates`."""
         if self.axis is None:
             return np.eye(3)
         axis = _AXES.index(self.axis)
@@ -241,7 +241,7 @@ class TipTurn:
         return np.vstack([tilting[_others(axis)], along])
 
     def _split_about_axis(self, turned: ca.SX, p: ca.SX | None) -> ca.SX:
-        """Tilt and turn of a rotation matrix, with its quaternion (w >= 0) unless they are to be differentiated."""
+        """Tilt and turn of a rotation matrix; the quaternion p (w >= 0) is None for derivatives."""
         assert self.axis is not None
         axis = _AXES.index(self.axis)
         tilts = tilt(turned, axis, p is None)
@@ -250,22 +250,22 @@ class TipTurn:
         return ca.vertcat(tilts, turn_about(turned, axis) if p is None else 2 * ca.atan2(p[1 + axis], p[0]))
 
     def rates(self, turning: ca.SX, moving: ca.SX) -> ca.SX:
-        """How fast the components change if the reference is the tip's present orientation, for each joint, (m, n).
+        """Rate of the components per joint, (m, n), with the tip's present orientation as the reference.
 
         Args:
             turning: angular velocity of the tip in its own axes, (3, n).
-            moving: velocity of the tip in whatever axes, (3, n).
+            moving: velocity of the tip in any fixed axes, (3, n).
         """
         rows = turning
         if self.axis is not None:
             axis = _AXES.index(self.axis)
-            # How fast the axis itself moves.
+            # Rate of the axis itself.
             tilting = -skew(ca.SX(np.eye(3)[axis])) @ turning
             rows = ca.vertcat(tilting[_others(axis), :], *([turning[axis, :]] if self.whole else []))
         return ca.vertcat(moving, rows) if self.with_position else rows
 
     def measure_half_turn_distance(self, x: Array) -> Array:
-        """cos(angle / 2) of the larger of tilt and turn, at task values (N, m), (N,): 0 where the components end."""
+        """cos(angle / 2) of the larger of tilt and turn at task values (N, m), (N,); 0 where the components end."""
         turns = x[:, 3:] if self.with_position else x
         angles = 2 * np.arcsin(np.minimum(np.linalg.norm(turns[:, : 3 if self.axis is None else 2], axis=1) / 2, 1.0))
         if self.axis is not None and self.whole:
@@ -275,7 +275,7 @@ class TipTurn:
 
 
 def _compute_cosine(sines: ca.SX) -> ca.SX:
-    """The positive cosine of half an angle, from sines (3, 1) times an axis; its derivative is finite."""
+    """Positive cosine of half an angle from sin(angle / 2) times the axis, (3, 1); its derivative is finite."""
     return ca.sqrt(ca.fmax(1 - ca.sumsqr(sines), _LEAST_SQUARE))
 
 
@@ -319,7 +319,7 @@ def _read_tool(tool: ArrayLike) -> tuple[Array, Array]:
     values = as_float_array("tool", tool)
     require_finite("tool", values)
     numbers = values[:3, 3] if values.shape == (4, 4) else values.ravel()
-    # Millimetres and degrees are the usual mistakes; the error names them.
+    # Millimetres and degrees are the usual mistakes, so the error hints at them.
     if hint := units_hint(("m", "m", "m", "rad", "rad", "rad"), numbers.tolist()):
         raise InvalidValueError("tool", values.tolist(), f"the pose of a tip{hint}")
     if values.shape == (4, 4):

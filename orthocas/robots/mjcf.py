@@ -1,4 +1,4 @@
-"""MJCF files and MuJoCo's compiled models as a `pin.Model` with the mass matrix and bias of MuJoCo."""
+"""MJCF files and compiled MuJoCo models as a `pin.Model` with the same mass matrix and bias."""
 
 import re
 from collections.abc import Mapping
@@ -17,28 +17,29 @@ _WORDS = ("name", "class", "childclass", "joint", "body", "file", "mesh", "mater
 
 
 def read_mjcf(source: Any, locked: Mapping[str, float] | None = None) -> tuple[pin.Model, dict[str, Mimic]]:
-    """The kinematics, masses, armatures, limits of position and effort, gravity, and mimic joints of an MJCF file.
+    """The kinematics, masses, armatures, limits of position and effort, gravity and mimic joints of an MJCF file.
 
     MuJoCo's own compiler reads the file, with meshes, includes, default classes, attached and replicated bodies. The
-    model has a frame for every body, named site and joint. If they share a name, `find_frame` prefers the body to the
-    site, and the site to the joint. Bodies and joints without a name are called body<i> and joint<i>, with MuJoCo's
-    indices i. Named keyframes become reference configurations.
+    model has a frame for every body, named site and named joint. If several share a name, `find_frame` prefers the body
+    to the site, and the site to the joint. Bodies and joints without a name are called body<i> and joint<i>, with
+    MuJoCo's index i. Named keyframes become reference configurations.
 
-    Mass matrix and bias are those of MuJoCo (qM and qfrc_bias). A `Robot` has no passive and constraint forces:
-    springs, damping, friction, gravity compensation (gravcomp), fluids and contacts. Of <equality>, active couplings of
-    two joints that are linear hold exactly: the first one mimics the second. Others are no part of a `Robot`.
+    Mass matrix and bias equal MuJoCo's qM and qfrc_bias. A `Robot` has no passive forces and no constraint forces:
+    springs, damping, friction, gravity compensation (gravcomp), fluids and contacts are ignored. Of <equality>, active
+    linear couplings of two joints are kept, as exact constraints: the first joint mimics the second. Others are
+    ignored.
 
-    The effort limit of a joint is the sum of |gear| times the force range of its actuators, or of |gain| times the
-    control range of motors, and at most its actuatorfrcrange.
+    The effort limit of a joint is the sum over its actuators of |gear| times the force range, or of |gear gain| times
+    the control range for motors. It is at most the joint's actuatorfrcrange.
 
     Args:
         source: the path of a file, or a `mujoco.MjModel`.
-        locked: joints that the caller locks: couplings in MuJoCo yield, so these follow no more, but are followed.
+        locked: joints that the caller locks. They stop following a coupling, but other joints still follow them.
 
     Raises:
         MissingExtraError: if MuJoCo is not installed.
-        RobotError: if MuJoCo refuses the file, or the model has no joint, armatures of tendons or actuators, or
-            flexible bodies, or joints follow each other in a loop.
+        RobotError: if MuJoCo refuses the file, if the model has no joint, armatures on tendons or actuators, or
+            flexible bodies, or if joints follow each other in a loop.
     """
     mujoco = import_extra("mujoco", "reading MJCF files", "mujoco")
     if isinstance(source, mujoco.MjModel):
@@ -49,7 +50,7 @@ def read_mjcf(source: Any, locked: Mapping[str, float] | None = None) -> tuple[p
     model = pin.Model()
     off = bool(compiled.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY)
     model.gravity.linear = np.zeros(3) if off else compiled.opt.gravity
-    # Of each body: the joint that moves it, and its pose in the joint's frame.
+    # For each body: the joint that moves it, and the body's pose in that joint's frame.
     carriers = [(0, pin.SE3.Identity())]
     for i in range(1, compiled.nbody):
         carriers.append(_add_body(mujoco, model, compiled, i, *carriers[compiled.body_parentid[i]]))
@@ -68,11 +69,11 @@ def compile_mjcf(path: Any) -> Any:
     """The `mujoco.MjModel` of a file; errors as in `read_mjcf`."""
     mujoco = import_extra("mujoco", "reading MJCF files", "mujoco")
     source = as_path("path", path)
-    # The bounds of size and depth, and no document types, protect MuJoCo's parser.
+    # Bounds on size and depth protect MuJoCo's parser, and so does the refusal of document types.
     root = read_xml(source, "MJCF", "mujoco")
     if sum(1 for _ in root.iter("body")) > RULES.links:
         raise RobotError(f"{source} has more than {RULES.links} bodies")
-    # refuse NaN, of which MuJoCo only prints a warning
+    # Refuse NaN, for which MuJoCo only prints a warning.
     for element in root.iter():
         for attribute, value in element.attrib.items():
             if attribute not in _WORDS and re.search(r"(?<!\w)[-+]?nan(?!\w)", value, re.IGNORECASE):
@@ -106,12 +107,11 @@ def _find_mimics(mujoco: Any, compiled: Any, locked: Mapping[str, float]) -> dic
 
 
 def _refuse_unread(compiled: Any, name: str) -> None:
-    """Refuse what changes the mass matrix and is not read."""
+    """Refuse model features that change the mass matrix and are not supported."""
     if not compiled.njnt:
         raise RobotError(f"{name} has no joint, expected at least one")
     if compiled.nbody - 1 > RULES.links:
         raise RobotError(f"{name} has more than {RULES.links} bodies")
-    # Numbers and names must be finite and readable.
     placed = [
         "body_pos",
         "body_quat",
@@ -129,7 +129,7 @@ def _refuse_unread(compiled: Any, name: str) -> None:
         raise RobotError(f"{name} has names that are not UTF-8, expected a file in UTF-8") from None
     if not all(np.isfinite(getattr(compiled, part)).all() for part in placed):
         raise RobotError(f"{name} holds numbers that are not finite")
-    # Flexible bodies and armatures of tendons and actuators change the mass matrix.
+    # Flexible bodies change the mass matrix, and so do armatures of tendons and actuators.
     if compiled.nflex:
         raise RobotError(f"{name} has a flexible body, which orthocas does not support")
     for kind in ("tendon", "actuator"):
@@ -145,7 +145,7 @@ def _add_body(mujoco: Any, model: pin.Model, compiled: Any, i: int, joint: int, 
     for k in range(compiled.body_jntadr[i], compiled.body_jntadr[i] + compiled.body_jntnum[i]):
         joint, placement = _add_joint(mujoco, model, compiled, k, joint, placement)
     model.addFrame(pin.Frame(name_body(compiled, i), joint, placement, pin.FrameType.BODY))
-    # Bodies fixed to the world load no joint.
+    # Bodies that are fixed to the world load no joint.
     if joint:
         turn = pin.Quaternion(*compiled.body_iquat[i]).matrix()
         inertia = turn @ np.diag(compiled.body_inertia[i]) @ turn.T
@@ -171,7 +171,7 @@ def _add_joint(mujoco: Any, model: pin.Model, compiled: Any, k: int, parent: int
         index = model.addJoint(parent, pin.JointModelSpherical(), placement * anchor, name)
     else:
         slides, axis = kind == mujoco.mjtJoint.mjJNT_SLIDE, compiled.jnt_axis[k].copy()
-        # In the pose of the file, the position of the joint is `ref`.
+        # In the pose of the file, the joint position equals `ref`.
         back = -axis * compiled.qpos0[compiled.jnt_qposadr[k]]
         shift = pin.SE3(np.eye(3), back) if slides else pin.SE3(pin.exp3(back), np.zeros(3))
         moved = (pin.JointModelPrismaticUnaligned if slides else pin.JointModelRevoluteUnaligned)(axis)
@@ -185,18 +185,18 @@ def _add_joint(mujoco: Any, model: pin.Model, compiled: Any, k: int, parent: int
 
 
 def _find_effort(mujoco: Any, compiled: Any, k: int) -> float:
-    """The largest force [N] or torque [N m] of both signs at joint k; inf if an actuator has no limit, or none acts."""
+    """Largest force [N] or torque [N m] available in both directions at joint k; inf without actuators or limits."""
     limit = _reach(compiled.jnt_actfrcrange[k]) if compiled.jnt_actfrclimited[k] else np.inf
     at_joint = (int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT))
     plain = (mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtDyn.mjDYN_NONE)
     total = 0.0
     for i in range(compiled.nu):
         gear = abs(compiled.actuator_gear[i, 0])
-        # Motors behind tendons and sites have no torque of one joint alone.
+        # Motors that act through tendons or sites do not have a torque at one joint.
         if compiled.actuator_trntype[i] not in at_joint or compiled.actuator_trnid[i, 0] != k or not gear:
             continue
         force = _reach(compiled.actuator_forcerange[i]) if compiled.actuator_forcelimited[i] else np.inf
-        # Of a motor, the force is the gain times the control.
+        # The force of a motor is gain times control.
         kind = compiled.actuator_gaintype[i], compiled.actuator_biastype[i], compiled.actuator_dyntype[i]
         if kind == plain and compiled.actuator_ctrllimited[i]:
             force = min(force, abs(compiled.actuator_gainprm[i, 0]) * _reach(compiled.actuator_ctrlrange[i]))
@@ -206,11 +206,11 @@ def _find_effort(mujoco: Any, compiled: Any, k: int) -> float:
 
 
 def _reach(ends: Array) -> float:
-    """The largest value that both signs of a range reach; inf if it has only one sign."""
+    """The largest magnitude available in both directions of a range; inf if the range has only one sign."""
     lower, upper = ends
     return float(min(-lower, upper)) if lower < 0 < upper else np.inf
 
 
 def build_pose(position: Array, quaternion: Array) -> pin.SE3:
-    """A pose; MuJoCo's quaternions begin with their real part, as the arguments of Pinocchio's do."""
+    """A pose. MuJoCo's quaternions and Pinocchio's constructor both begin with the real part."""
     return pin.SE3(pin.Quaternion(*quaternion).normalized().matrix(), position.copy())

@@ -1,4 +1,4 @@
-"""Scenes of named solids around a robot; obstacles are the solids, also of what a link carries."""
+"""Scenes of named solids around a robot, and the solids, which links may also carry."""
 
 from __future__ import annotations
 
@@ -34,14 +34,14 @@ class ObstacleRules:
     """Numbers of obstacles."""
 
     farthest: float = 1e6  #: [m] largest length
-    cells: int = 30_000  #: of a point cloud along an axis, which an octree can have
+    cells: int = 30_000  #: largest number of cells of a point cloud along an axis, a limit of octrees
 
 
 RULES = ObstacleRules()
 
 
 def __getattr__(name: str) -> Any:
-    """What became of a name that is no longer there."""
+    """Explain a name that was removed."""
     if name in ("LinkDistances", "Obstacle"):
         now = "robot.with_rods(radius).collisions.with_scene(oc.Scene({name: solid})) has these distances"
         raise AttributeError(f"orthocas.obstacles has no {name}: {now}")
@@ -50,7 +50,7 @@ def __getattr__(name: str) -> Any:
 
 @runtime_checkable
 class Solid(Protocol):
-    """A solid in the world, or in the frame of what carries it."""
+    """A solid, placed in the world or in the frame that carries it."""
 
     @property
     def heading(self) -> str:
@@ -67,7 +67,7 @@ class Scene(Shown):
     """Solids around a robot, by name, in the frame of the world; see `Collisions.with_scene`.
 
     Args:
-        solids: of `orthocas.obstacles`: boxes, spheres, capsules, planes, meshes and point clouds.
+        solids: boxes, spheres, capsules, planes, meshes and point clouds of `orthocas.obstacles`, by name.
 
     Example:
         >>> import orthocas as oc
@@ -138,7 +138,7 @@ class Capsule:
 
     Args:
         start: one end of the segment, (3,) in the world [m].
-        end: the other end.
+        end: the other end of the segment.
         radius: > 0 [m].
     """
 
@@ -170,7 +170,7 @@ class Plane:
 
     Args:
         normal: (3,) in the world, of any length > 0.
-        point: a point of the surface, (3,) [m].
+        point: any point of the surface, (3,) [m].
     """
 
     normal: Array
@@ -180,7 +180,7 @@ class Plane:
         direction = freeze_array("normal", normal, (3,))
         length = float(np.linalg.norm(direction))
         if not 1e-9 < length < np.inf:
-            raise InvalidValueError("normal", direction.tolist(), "a direction, of a length above 1e-9")
+            raise InvalidValueError("normal", direction.tolist(), "a vector longer than 1e-9")
         object.__setattr__(self, "normal", freeze_array("normal", direction / length, (3,)))
         object.__setattr__(self, "point", freeze_array("point", point, (3,)))
 
@@ -202,7 +202,7 @@ class Box:
     Args:
         size: edge lengths (3,) [m], > 0.
         centre: (3,) in the world [m].
-        rotation: (3, 3), from the axes of its edges to those of the world.
+        rotation: (3, 3), from the axes of the box to those of the world.
     """
 
     size: Array
@@ -235,9 +235,9 @@ class Mesh:
 
     Args:
         points: (N, 3) in the frame of the mesh [m], or the path of a mesh file (STL, OBJ, DAE).
-        position: of the mesh in the world, (3,) [m].
+        position: origin of the mesh in the world, (3,) [m].
         rotation: (3, 3), from the axes of the mesh to those of the world.
-        scale: by which the points are multiplied.
+        scale: factor of the points.
 
     Raises:
         RobotError: if the file cannot be read.
@@ -256,11 +256,11 @@ class Mesh:
         scale: float = 1.0,
     ) -> None:
         factor = _check_size("scale", scale)
-        # corners of a file, or those given
+        # Corners come from a file, or are given.
         if isinstance(points, str | PathLike):
             path = as_path("points", points)
             if not path.is_file():
-                raise RobotError(f"cannot read mesh file {path}: there is none")
+                raise RobotError(f"cannot read mesh file {path}: no such file")
             try:
                 corners = read_mesh(path, np.full(3, factor))[0]
             except ValueError as error:
@@ -270,7 +270,7 @@ class Mesh:
         try:
             hull = HullGeometry.around(corners)
         except ValueError as error:
-            raise InvalidValueError("points", str(error), "corners of a solid") from None
+            raise InvalidValueError("points", str(error), "points that span a volume") from None
         object.__setattr__(self, "points", freeze_array("points", hull.points, (None, 3)))
         object.__setattr__(self, "position", freeze_array("position", position, (3,)))
         turn = np.eye(3) if rotation is None else rotation
@@ -289,7 +289,7 @@ class Mesh:
 
 @dataclass(frozen=True, eq=False)
 class PointCloud:
-    """Points of a camera or a scanner: the cubes of a lattice that hold one.
+    """Points of a camera or a scanner; solid are the cubes of a grid that contain at least one point.
 
     Args:
         points: (N, 3) in the world [m].
@@ -315,7 +315,7 @@ class PointCloud:
 
     @property
     def shape(self) -> Shape:
-        """The cubes for collision checks."""
+        """The cubes as an octree for collision checks."""
         return Shape(CloudGeometry(self.points, self.cell), np.eye(3), np.zeros(3))
 
 

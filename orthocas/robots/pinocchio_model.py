@@ -1,4 +1,4 @@
-"""`pin.Model`: its joints and frames as a `KinematicTree`, locked joints, default tips, postures, and planar arms."""
+"""Work with a `pin.Model`: convert it to a `KinematicTree`, lock joints, find tips and postures, build planar arms."""
 
 import logging
 import re
@@ -15,31 +15,31 @@ from orthocas.tools.checks import Array, freeze_array, require_known
 
 _log = logging.getLogger(__name__)
 
-LINKS = (pin.FrameType.BODY, pin.FrameType.OP_FRAME)  #: links of URDF, bodies and sites of MJCF
-_UNLIMITED = 1e10  #: numbers above it are no limits: Pinocchio uses the largest double
+LINKS = (pin.FrameType.BODY, pin.FrameType.OP_FRAME)  #: frames of links in URDF, of bodies and sites in MJCF
+_UNLIMITED = 1e10  #: limits above this count as infinite: Pinocchio uses the largest double
 _GRIPPER = re.compile("gripper|finger|jaw", re.IGNORECASE)
 _FINGER = re.compile("finger|jaw", re.IGNORECASE)
-_SHAPE = re.compile("_sc$|collision", re.IGNORECASE)  #: frames of shapes that stand for links in collision checks
+_SHAPE = re.compile("_sc$|collision", re.IGNORECASE)  #: names of frames that only stand for shapes in collision checks
 _TOOL = re.compile("tool|tcp|end_?effector|eef|(^|_)ee(_|$)", re.IGNORECASE)
-_SHORTEST_ARM = 3  #: joints before the fingers of a hand, more than that
+_SHORTEST_ARM = 3  #: a hand needs an arm with more joints than this before it
 WORLD = "universe"  #: Pinocchio's name for what does not move
 TIP = "tip"
 GRAVITY = 9.81  #: [m/s^2]
 
 
 class Mimic(NamedTuple):
-    """How a joint follows an independent one: its position is factor x position of the leader + offset."""
+    """How a joint follows an independent one: its position is factor * (position of the leader) + offset."""
 
     leader: str
     factor: float
     offset: float  #: [rad] or [m]
 
 
-Mimics = Mapping[str, Mimic]  #: by the name of the joint that follows
+Mimics = Mapping[str, Mimic]  #: keys: names of the joints that follow
 
 
 def resolve_mimics(direct: Mimics) -> dict[str, Mimic]:
-    """Each joint that follows, with its independent leader: leaders in `direct` may follow others.
+    """Map each following joint to its independent leader. Leaders in `direct` may themselves follow others.
 
     Raises:
         RobotError: if joints follow each other in a loop.
@@ -47,7 +47,6 @@ def resolve_mimics(direct: Mimics) -> dict[str, Mimic]:
     resolved = {}
     for name in direct:
         leader, factor, offset, passed = name, 1.0, 0.0, set[str]()
-        # Factors multiply, offsets add up.
         while leader in direct:
             if leader in passed:
                 raise RobotError(f"joint '{name}' mimics itself")
@@ -61,9 +60,9 @@ def resolve_mimics(direct: Mimics) -> dict[str, Mimic]:
 
 
 def build_tree(model: pin.Model, *tips: str, base: str | None = None, mimics: Mimics | None = None) -> KinematicTree:
-    """Read joints, bodies, limits, tips and links from a Pinocchio model, whose base may move; see `place_on_base`.
+    """Read joints, bodies, limits, tips and links from a Pinocchio model. Its base may move; see `place_on_base`.
 
-    Joints of `mimics` follow their leaders; the limits of a leader keep them within their own.
+    Joints of `mimics` follow their leaders. The limits of each leader are narrowed so that its followers keep theirs.
 
     Raises:
         UnknownNameError: if there is no frame with the name of a tip.
@@ -76,7 +75,7 @@ def build_tree(model: pin.Model, *tips: str, base: str | None = None, mimics: Mi
     axes = [find_axis(model, i) for i in range(1, model.njoints)]
     # Each body frame is turned so that the joint's axis is its z axis.
     turns = [np.eye(3)] + [rotate_z_to(axis) for _, axis in axes]
-    # Joints that move by themselves come first, then those that follow them.
+    # Independent joints come first, then the mimic joints.
     follow = {model.getJointId(name): mimic for name, mimic in (mimics or {}).items() if model.existJointName(name)}
     leaders = [i for i in range(1, model.njoints) if i not in follow]
     followers = [i for i in range(1, model.njoints) if i in follow]
@@ -119,7 +118,7 @@ def build_tree(model: pin.Model, *tips: str, base: str | None = None, mimics: Mi
         mimic_factors=np.array([follow[i].factor for i in followers]),
         mimic_offsets=np.array([follow[i].offset for i in followers]),
     )
-    # What a moving base carries are the links that no joint of the file moves.
+    # The moving base itself has the links that no joint of the file moves.
     own = model.inertias[0]
     return tree if base is None else place_on_base(tree, base, own.mass, own.lever, own.inertia)
 
@@ -179,14 +178,14 @@ def suggest_lock(joint: str) -> str:
 def _find_limits(
     model: pin.Model, bodies: list[int], follow: list[Mimic], led: list[int]
 ) -> tuple[Array, Array, Array]:
-    """Lower and upper positions and largest speeds of n independent joints, (n,), that keep mimic joints in their own.
+    """Lower and upper limits and largest speeds of the n independent joints, (n,), so that mimic joints keep theirs.
 
-    With q_f = a q + b in [l, u], q is between (l - b) / a and (u - b) / a, and |dq| at most the speed over |a|. Limits
-    of a mimic joint that would leave its leader no way at all are ignored, as ROS ignores them, and logged. An endless
-    joint gets a turn from -pi to pi, where its next turns would bring a mimic joint elsewhere.
+    With q_f = a q + b in [l, u], q lies between (l - b) / a and (u - b) / a, and |dq| is at most the speed limit over
+    |a|. If the limits of a mimic joint leave its leader no range at all, they are ignored and logged, as in ROS. An
+    endless joint is limited to [-pi, pi] if a full turn would not bring its mimic joints back to the same place.
     """
     n = len(bodies) - len(follow)
-    # Own limits of all joints first, then the leaders are narrowed to what their mimics can follow.
+    # Read the limits of all joints, then narrow the leaders to the range of their mimic joints.
     ends: tuple[list[float], list[float]] = ([], [])
     for i in bodies:
         joint = model.joints[i]
@@ -200,7 +199,7 @@ def _find_limits(
         speeds[leader] = min(speeds[leader], speeds[n + j] / abs(mimic.factor))
         low, high = sorted((end[n + j] - mimic.offset) / mimic.factor for end in (lower, upper))
         low, high = max(float(lower[leader]), low), min(float(upper[leader]), high)
-        # Positions of joints without limits repeat after a turn everywhere else.
+        # Full turns of an endless leader must bring the mimic joint back to the same place; otherwise limit the leader.
         slides, leads = (find_axis(model, i)[0] == "prismatic" for i in (bodies[n + j], bodies[leader]))
         if np.isinf([low, high]).all() and not leads and (slides or mimic.factor % 1):
             low, high = -np.pi, np.pi
@@ -238,7 +237,7 @@ def lock_joints(model: pin.Model, locked: Mapping[str, float], mimics: Mimics | 
     """
     if not isinstance(locked, Mapping):
         raise InvalidValueError("locked", locked, "a mapping from joint names to positions")
-    # Each joint gets its position; those that mimic one of them follow.
+    # Set each locked joint, and the joints that mimic it.
     names = list(model.names)[1:]
     position = pin.neutral(model)
     ids = []
@@ -259,18 +258,18 @@ def lock_joints(model: pin.Model, locked: Mapping[str, float], mimics: Mimics | 
 
 
 def lock_off_chain(model: pin.Model, *tips: str, mimics: Mimics | None = None) -> pin.Model:
-    """Lock every joint that moves no tip, of any type, at neutral or at the limit closest to zero.
+    """Lock every joint that moves no tip, whatever its type, at its neutral position or the limit closest to zero.
 
-    Leaders of mimic joints that move a tip are kept, and so are all joints that follow them.
+    Leaders of mimic joints that move a tip are kept, and all joints that follow these leaders.
 
     Raises:
         UnknownNameError: if there is no frame with the name of a tip.
-        RobotError: as in `lock_others`; if the leader of a mimic joint is none of the model.
+        RobotError: as in `lock_others`; also if the leader of a mimic joint is not in the model.
     """
     follow = {name: mimic for name, mimic in (mimics or {}).items() if model.existJointName(name)}
     chains = [model.supports[model.frames[find_frame(model, tip)].parentJoint] for tip in tips]
     moving = {model.names[i] for supports in chains for i in supports if i > 0}
-    # A mimic joint on the way needs its leader, wherever that is, and the leader moves its other mimics too.
+    # A mimic joint on the chain needs its leader, wherever that is, and the leader moves its other mimic joints too.
     for name in sorted(moving & follow.keys()):
         if not model.existJointName(leader := follow[name].leader):
             raise RobotError(f"joint '{name}' mimics joint '{leader}', which the file does not have")
@@ -280,14 +279,14 @@ def lock_off_chain(model: pin.Model, *tips: str, mimics: Mimics | None = None) -
 
 
 def lock_others(model: pin.Model, chain: list[int], mimics: Mimics | None = None) -> pin.Model:
-    """Lock every joint that is not in a chain, of any type, at neutral or at the limit closest to zero.
+    """Lock every joint outside a chain, whatever its type, at its neutral position or the limit closest to zero.
 
     Raises:
         RobotError: if a joint of the chain is not revolute, continuous or prismatic. The message names it.
     """
     for i in chain:
         find_axis(model, i)
-    # all others stand at neutral, moved into their limits
+    # Put all other joints at neutral, moved into their limits.
     ids = [i for i in range(1, model.njoints) if i not in chain]
     position, following = pin.neutral(model), set(model.mimicking_joints)
     for i in ids:
@@ -295,7 +294,7 @@ def lock_others(model: pin.Model, chain: list[int], mimics: Mimics | None = None
         if joint.nq == joint.nv == 1 and i not in following:
             limits = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
             position[joint.idx_q] = np.clip(0.0, *limits)
-    # mimic joints stand where their leaders take them
+    # Put mimic joints where their leaders take them.
     for i in ids:
         if mimic := (mimics or {}).get(model.names[i]):
             k = model.getJointId(mimic.leader)
@@ -306,19 +305,17 @@ def lock_others(model: pin.Model, chain: list[int], mimics: Mimics | None = None
 
 
 def fix_joints(model: pin.Model, ids: list[int], position: Array) -> pin.Model:
-    """The model with joints fixed at a position.
+    """The model with some joints fixed at a configuration.
 
-    Pinocchio finds joints by name among all frames, so others get names of their own meanwhile: bodies, sites and
-    joints may share one.
+    Pinocchio looks up joints by name among all frames, and in a model a body, a site and a joint may share a name. So
+    all frames that are not joints get unique names while joints are fixed.
 
     Raises:
         RobotError: if a joint has the name of Pinocchio's world.
     """
     if WORLD in list(model.names)[1:]:
-        raise RobotError(
-            f"a joint is called '{WORLD}', which no joint can be called while joints are locked: rename it"
-        )
-    # Frames other than joints get unique names meanwhile.
+        raise RobotError(f"a joint is called '{WORLD}', which is reserved when joints are locked: rename the joint")
+    # Rename frames other than joints for now.
     renamed, names = model.copy(), {}
     for i, frame in enumerate(renamed.frames):
         if i > 0 and frame.type != pin.FrameType.JOINT:
@@ -342,7 +339,7 @@ def set_position(model: pin.Model, i: int, value: float, position: Array) -> Non
                 f"a joint with {joint.nv} degrees of freedom can only be locked at its neutral position"
             )
         return
-    # Angles that look like degrees are mistakes.
+    # A large angle is probably in degrees.
     turns = joint.shortname().startswith("JointModelR")
     if turns and (hint := degrees_hint(value)):
         raise InvalidValueError(f"locked position of joint '{name}'", f"{value:g}", f"an angle in radians{hint}")
@@ -354,11 +351,11 @@ def _refuse_lock(name: str, leader: str) -> RobotError:
 
 
 def find_default_tip(model: pin.Model) -> str:
-    """The end of the longest arm: of the chain with most joints, of equal ones the first.
+    """Name of the frame at the end of the longest chain of joints; if several are equally long, of the first one.
 
-    Joints of a gripper or of the fingers of a hand are not moved and not counted. Of the frames at the end it is the
-    last one that is called a tool or an end effector; otherwise the last one that is no part of a finger and no shape
-    for collision checks. On robots with several chains a TipWarning names the others.
+    Joints of a gripper or of the fingers of a hand are not counted. If a frame at the end is called a tool or an end
+    effector, the last such frame is the tip. Otherwise it is the last frame that belongs neither to a finger nor to a
+    collision shape. If the robot has several chains, a TipWarning names the others.
 
     Raises:
         RobotError: if no joint moves.
@@ -369,7 +366,7 @@ def find_default_tip(model: pin.Model) -> str:
     ends = [i for i in ids if i not in carriers]
     if not ends:
         raise RobotError("the robot has no movable joint, expected at least one")
-    # The first of the longest chains, with a word about the others.
+    # Take the first of the longest chains, and mention the others.
     longest = max(ends, key=lambda i: (len(model.supports[i]), -i))
     moving = [i for i in model.supports[longest] if i and model.joints[i].nv == 1]
     names = {i: _list_ends(model, i) for i in ends}
@@ -382,14 +379,14 @@ def find_default_tip(model: pin.Model) -> str:
 
 
 def find_floating_base(model: pin.Model, tips: Sequence[str]) -> list[str]:
-    """Joints with six degrees of freedom that carry the first joints on the way to the tips."""
+    """Joints with six degrees of freedom at the root of the chains to the tips."""
     chains = [model.supports[model.frames[find_frame(model, tip)].parentJoint] for tip in tips]
     roots = {chain[1] for chain in chains if len(chain) > 2}
     return [model.names[i] for i in sorted(roots) if model.joints[i].shortname() == "JointModelFreeFlyer"]
 
 
 def _carries_fingers(model: pin.Model, i: int) -> bool:
-    """Whether a hand begins behind a joint: chains side by side, none longer than the arm before it."""
+    """Whether a hand begins behind a joint: parallel chains, none of them longer than the arm before it."""
     above, below = list(model.supports[i]), [k for k in range(i + 1, model.njoints) if i in model.supports[k]]
     branching = [k for k in above[:-1] if sum(parent == k for parent in model.parents) > 1]
     arm = len(above) - 1 - (above.index(branching[-1]) if branching else 0)
@@ -399,19 +396,19 @@ def _carries_fingers(model: pin.Model, i: int) -> bool:
 
 
 def _is_of_gripper(model: pin.Model, i: int) -> bool:
-    """Whether a joint is called after a gripper, or its link after a finger, as are all that it carries."""
+    """Whether a joint and all joints that it carries belong to a gripper or a finger, by the names of joint or link."""
     link = next((frame.name for frame in model.frames if frame.parentJoint == i and frame.type in LINKS), "")
     own = _GRIPPER.search(model.names[i]) or _FINGER.search(link)
     return bool(own) and all(_is_of_gripper(model, k) for k in range(i + 1, model.njoints) if model.parents[k] == i)
 
 
 def _list_ends(model: pin.Model, i: int) -> list[str]:
-    """The frames of a body that stand for its end: the best one, then the others that carry no further frame."""
+    """Candidate tips of a body: the best frame first, then the others that carry no further frame."""
     frames = {k: frame for k, frame in enumerate(model.frames) if frame.parentJoint == i}
     links = [k for k in frames if frames[k].type in LINKS] or list(frames)
     plain = [k for k in links if not (_FINGER.search(frames[k].name) or _SHAPE.search(frames[k].name))]
     best = [*links, *plain, *(k for k in plain if _TOOL.search(frames[k].name))][-1]
-    # The parent of a link is a fixed joint, whose parent is a link.
+    # The parent frame of a link is a fixed joint, whose parent frame is a link.
     inner = {model.frames[frames[k].parentFrame].parentFrame for k in plain}
     return [frames[best].name, *(frames[k].name for k in plain if k != best and k not in inner)]
 
@@ -426,13 +423,13 @@ def read_model_postures(model: pin.Model, joint_names: Sequence[str]) -> dict[st
             if joint.nv == 1:
                 part = position[joint.idx_q : joint.idx_q + joint.nq]
                 joints[name] = float(part[0]) if len(part) == 1 else float(np.arctan2(part[1], part[0]))
-    # Pinocchio's name for the zero posture of an MJCF file, which is not in the file.
+    # Pinocchio adds the zero posture of an MJCF file under this name; the file does not have it.
     states.pop("qpos0", None)
     return collect_postures(states, joint_names)
 
 
 def collect_postures(states: Mapping[str, Mapping[str, float]], joint_names: Sequence[str]) -> dict[str, Array]:
-    """States as joint positions (n,), with a moving base at 0. States that lack another joint are skipped."""
+    """States as joint positions (n,), with a moving base at 0. States without a value for another joint are skipped."""
     placed = {name: {**dict.fromkeys(BASE_JOINTS, 0.0), **joints} for name, joints in states.items()}
     return {
         name: np.array([joints[joint] for joint in joint_names])
@@ -462,7 +459,6 @@ def build_planar(lengths: Sequence[float], masses: Sequence[float]) -> pin.Model
     for name, values in (("lengths", lengths), ("masses", masses)):
         if not values or min(values) <= 0:
             raise InvalidValueError(name, values, "positive numbers, one per link")
-    # The model: one revolute joint and one uniform rod a link.
     model = pin.Model()
     model.name = f"planar_{len(lengths)}r"
     model.gravity.linear = np.array([0.0, -GRAVITY, 0.0])

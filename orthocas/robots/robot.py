@@ -55,7 +55,7 @@ _log = logging.getLogger(__name__)
 Locked = Mapping[str, float] | None  #: joint -> position at which it is locked [rad] or [m]
 Tool = ArrayLike | None
 Gravity = ArrayLike | None
-_Key = tuple[str | None, ...]  #: name of a function, then frames
+_Key = tuple[str | None, ...]  #: name of a function, then names of frames
 FrameQuantity = Literal["position", "rotation", "jacobian"]
 
 
@@ -90,7 +90,7 @@ class Robot(Shown):
         self.tree = tree
         #: named postures (n,) of the robot's files: SRDF group states, MJCF keyframes. Chart files do not store them.
         self.homes = {name: freeze_array(f"home '{name}'", q, (tree.n,)) for name, q in homes.items()}
-        #: the files that `collisions` reads, or solids of a chart file; None if there are none
+        #: the files that `collisions` reads, or the solids of a chart file; None if there are none
         self.solids = solids
 
     @classmethod
@@ -110,20 +110,20 @@ class Robot(Shown):
         Every joint that moves no tip, of any type, is locked at zero, or at the limit closest to zero.
 
         Args:
-            path: the file; one whose name ends in .xacro is expanded first, which runs its expressions. Named postures
-                (`homes`) come from an SRDF file with the same stem, beside it or in ../srdf, or from the keyframes of
-                the MJCF file.
-            tip: name of any frame. Default: the end of the longest arm; where there are several chains, a TipWarning
+            path: the file. A file whose name ends in .xacro is expanded first, which runs its expressions. Named
+                postures (`homes`) come from an SRDF file with the same stem, beside it or in ../srdf, or from the
+                keyframes of the MJCF file.
+            tip: name of any frame. Default: the end of the longest chain; if there are several chains, a TipWarning
                 names the others.
-            locked: joints to lock elsewhere, or on the chain to a tip, with their positions [rad] or [m]. Joints that
+            locked: joints to lock, with their positions [rad] or [m]; also joints on the chain to a tip. Joints that
                 mimic them follow. A floating, spherical or planar joint is locked at its neutral position, given as 0.
             tool: pose of the tip of a massless tool in the (first) tip frame; see `with_tool`.
             tips: names of several frames, such as two hands, in place of `tip`.
             base: "planar" for a base that slides along the world's x and y and turns about z, by the joints base_x,
-                base_y, base_heading; "rail:x", "rail:y", "rail:z"; or "floating" for a base that nothing holds or
-                drives, without gravity, by the joints float_x, float_y, float_z, float_yaw, float_pitch, float_roll
-                ("floating:xy" in the plane, by float_x, float_y, float_heading); see `zero_momentum`. They come first,
-                and have no limits. Default: a fixed base.
+                base_y, base_heading; "rail:x", "rail:y" or "rail:z" for a rail; "floating" for a free base without
+                drives and without gravity, by the joints float_x, float_y, float_z, float_yaw, float_pitch, float_roll;
+                "floating:xy" for a free base in the plane, by float_x, float_y, float_heading. See `zero_momentum` for
+                free bases. These joints come first and have no limits. Default: a fixed base.
             gravity: gravity acceleration in the axes of the base, (3,) [m/s^2], such as (0, 0, 9.81) for an arm that
                 hangs from a ceiling. Default: (0, 0, -9.81), or that of the MJCF file.
 
@@ -149,10 +149,10 @@ class Robot(Shown):
     ) -> Self:
         """Build a known robot, such as "panda", from a file of example-robot-data or of robot_descriptions.
 
-        One of these packages has to be installed; the other arguments are those of `from_file`.
+        One of these packages must be installed. The other arguments are those of `from_file`.
 
         Raises:
-            UnknownNameError: if no installed package knows the name; the error has the known ones.
+            UnknownNameError: if no installed package knows the name. The message lists the known names.
         """
         return cls.from_urdf(find_robot_file(name), tip, locked, tool, tips=tips, base=base, gravity=gravity)
 
@@ -170,11 +170,11 @@ class Robot(Shown):
     ) -> Self:
         """Build the joints that move the tips from a URDF file; see `from_file`."""
         file, names = as_path("path", path), _check_tips(tip, tips)
-        # A bare name such as panda is meant for from_name.
+        # Someone who passes a bare name such as panda probably wants from_name.
         if not file.suffix and not file.exists() and file.name in list_robot_files():
             raise RobotError(f"cannot read URDF file {file}: no such file; Robot.from_name('{file}') knows this name")
         tree, _ = _build_chain(*read_urdf(file), names, locked, tool, base, gravity)
-        # Solids are read when they are asked for: meshes take longer than all else.
+        # Read solids only on demand: meshes take longer than everything else.
         source = CollisionSource(file.absolute(), None, dict(locked or {}))
         return cls(tree, read_srdf_postures(file, tree.joint_names), source)
 
@@ -196,7 +196,7 @@ class Robot(Shown):
         """
         tree, model = _build_chain(*read_mjcf(path, locked), _check_tips(tip, tips), locked, tool, base, gravity)
         homes = read_model_postures(model, tree.joint_names)
-        # A compiled model has no file to read solids from later.
+        # A compiled model has no file from which solids could be read later.
         if not isinstance(path, str | PathLike):
             return cls(tree, homes)
         return cls(tree, homes, CollisionSource(as_path("path", path).absolute(), None, dict(locked or {})))
@@ -301,7 +301,7 @@ class Robot(Shown):
 
         Args:
             urdf: the robot's URDF file, or its MJCF file, whose name ends in .xml.
-            srdf: an SRDF file whose disabled pairs are not checked. Default: the one with the same stem, beside the
+            srdf: an SRDF file, whose disabled pairs are not checked. Default: the one with the same stem, beside the
                 URDF file or in ../srdf.
         """
         locked = {} if self.solids is None else self.solids.locked
@@ -309,14 +309,14 @@ class Robot(Shown):
         return type(self)(self.tree, self.homes, CollisionSource(as_path("urdf", urdf), pairs, locked))
 
     def with_rods(self, radius: ArrayLike) -> Self:
-        """The same robot with rods for links, for `collisions` of robots whose files have no solids.
+        """The same robot with rods as links, so that `collisions` works for robots whose files have no solids.
 
-        A link is a capsule from the origin of its joint to that of the next joint, or to a tip, for all links that move
-        on the ways to the tips. Rods are checked against what is around, `collisions.with_scene(...)`, and not against
-        each other. Where a slide takes the next joint away, its rod begins there.
+        Each moving link on the way to a tip becomes a capsule from the origin of its joint to that of the next joint,
+        or to the tip. If the next joint slides, its rod begins where the slide has taken it. Rods are checked against
+        objects, `collisions.with_scene(...)`, but not against each other.
 
         Args:
-            radius: of all rods, or of each joint's, (n,), > 0 [m].
+            radius: radius of all rods, or (n,) of each joint's rod, > 0 [m].
 
         Example:
             >>> import orthocas as oc
@@ -333,11 +333,11 @@ class Robot(Shown):
         """Distances between the links, from <collision> elements of a URDF file, MJCF geoms, or a chart file.
 
         Raises:
-            RobotError: if the robot comes from no file, the file or all its solids are missing.
+            RobotError: if the robot was not built from a file, or the file or all its solids are missing.
         """
         if self.solids is None:
             hint = "robot.with_solids(urdf) names its file, robot.with_rods(radius) takes rods for links"
-            raise RobotError(f"nothing is known of the links' solids, expected a robot of a URDF or MJCF file: {hint}")
+            raise RobotError(f"the links have no solids, expected a robot from a URDF or MJCF file: {hint}")
         return self.solids.read(self.tree)
 
     def home(self, name: str) -> Array:
@@ -401,7 +401,7 @@ class Robot(Shown):
         """Joints, limits, tip and mass. Limits of effort and velocity are left out if the file has none."""
         tree = self.tree
         tips = f"tip {tree.tip_name}" if not tree.tips else f"tips {listed(self.tips)}"
-        # Lines that would say nothing are left out.
+        # Leave out lines without information.
         sliding = [name for name, slides in zip(tree.joint_names, tree.prismatic, strict=True) if slides]
         return {
             "robot": f"{self.n} joints, {tips}, {tree.masses.sum():.4g} kg",
@@ -435,11 +435,11 @@ class Robot(Shown):
         return self._call("forward_dynamics", q, dq, tau)
 
     def zero_momentum(self, q: Any) -> Any:
-        """H(q), (n, a): the velocities of all n joints per velocity of the a joints of the arms, on a floating base.
+        """H(q), (n, a): velocities of all n joints of a robot with a floating base, per velocity of its a arm joints.
 
-        The base moves so that the momentum stays zero: dq = H da with H = [-M_bb^-1 M_ba; I]. Then J H is the
-        generalised Jacobian of a task with the Jacobian J, and H^T M H the generalised inertia. H is not the Jacobian
-        of a function: where the base ends depends on the path of the arms.
+        The base moves such that the momentum stays zero: dq = H da with H = [-M_bb^-1 M_ba; I]. For a task with
+        Jacobian J, J H is the generalised Jacobian, and H^T M H is the generalised inertia. H is not the Jacobian of a
+        function, because the final pose of the base depends on the path of the arms.
 
         Raises:
             RobotError: if the base does not float.
@@ -468,7 +468,7 @@ class Robot(Shown):
         return self._call("tip_jacobian", q)
 
     def pose(self, q: Any, frame: str | None = None) -> Any:
-        """Pose of a frame, or of the tip, in the world: (4, 4) [m], rotation and position above (0, 0, 0, 1).
+        """Pose of a frame, or of the tip, in the world: a homogeneous transform (4, 4) [m].
 
         Example:
             >>> import orthocas as oc
@@ -515,7 +515,7 @@ class Robot(Shown):
     def frame_jacobian(self, q: Any, frame: str, relative_to: str | None = None) -> Any:
         """Geometric Jacobian of a frame, (6, n): linear rows, then angular rows.
 
-        They are in axes of the world, or in those of another frame and as seen from it.
+        Rows are in world axes, or relative to another frame and in its axes.
         """
         return self._call(self._find_key("jacobian", frame, relative_to), q)
 
@@ -529,9 +529,9 @@ class Robot(Shown):
         """q (n, 1) -> position (3, 1), rotation (3, 3) or geometric Jacobian (6, n) of a frame, for larger graphs.
 
         Args:
-            quantity: which of them.
+            quantity: "position", "rotation" or "jacobian".
             frame: its name; None for the (first) tip.
-            relative_to: name of the frame in which it is described; None for the world.
+            relative_to: name of the frame of reference; None for the world.
 
         Raises:
             UnknownNameError: if there is no such quantity or frame.
@@ -542,7 +542,7 @@ class Robot(Shown):
     def joint_points(self, q: Any) -> Array:
         """A line to draw, along base, joint origins and tip: q (N, n) -> (N, points, 3) [m].
 
-        With several tips, it goes to the others first, and back along their joints.
+        With several tips, the line goes to the other tips first and returns along their joints.
         """
         points, single = as_point_set("q", q, self.n)
         flat = self._batched["joint_points",](points)[0].transpose(0, 2, 1)
@@ -575,7 +575,7 @@ class Robot(Shown):
         kind = ca.MX if by_bias else ca.SX
         arguments: list[Any] = [kind.sym(argument, PAYLOAD if argument == "payload" else self.n) for argument in names]
         if by_bias:
-            # Two calls of the bias, in which gravity cancels: no further code in generated C.
+            # The difference of two biases, in which gravity cancels, needs no further code in generated C.
             q, v, w, *payload = arguments
             bias = self.function("bias_with_payload" if payload else "bias")
             result = (bias(q, v + w, *payload) - bias(q, v - w, *payload)) / 4
@@ -584,7 +584,7 @@ class Robot(Shown):
         return dense_function(name, arguments, [result], names)
 
     def _find_key(self, quantity: str, frame: str | None, relative_to: str | None) -> _Key:
-        """Key of a frame's function; that of the tip in the world has a name of its own."""
+        """Key of a frame's function; the functions of the tip in the world have names of their own."""
         for name in (frame, relative_to):
             if name is not None:
                 self.tree.frame(name)
@@ -602,7 +602,7 @@ class Robot(Shown):
                 if shape != (self.n, 1):
                     raise ShapeError("a CasADi joint vector", shape, (self.n, 1))
             return function(*arguments)
-        # NumPy arguments give arrays, of one state or of a set.
+        # NumPy arguments give arrays, for one state or for a set.
         sets = [as_point_set(name, a, self.n) for name, a in zip(function.name_in(), arguments, strict=True)]
         points = [p for p, _ in sets]
         if len({len(p) for p in points}) > 1:
@@ -621,9 +621,9 @@ def _build_chain(
     base: str | None,
     gravity: Gravity,
 ) -> tuple[KinematicTree, pin.Model]:
-    """The joints that move the tips, without those that the user locks, as a tree and as a model."""
+    """The joints that move the tips, without joints that the user locks, as a tree and as a model."""
     tips = tips or (find_default_tip(model),)
-    # First what the user locks and a base that floats in the file, then all that moves no tip.
+    # First lock the user's joints and a base that floats in the file, then all joints that move no tip.
     model = lock_joints(model, locked or {}, mimics)
     if (floating := find_floating_base(model, tips)) and base is None:
         joint = floating[0]
@@ -635,20 +635,22 @@ def _build_chain(
 
 
 def _check_tips(tip: str | None, tips: Sequence[str]) -> tuple[str, ...]:
-    """The names of the tips; none where the default is wanted.
+    """The names of the tips; an empty tuple if none is given.
 
     Raises:
-        InvalidValueError: if they are no names, one appears twice, or both arguments are given.
+        InvalidValueError: if an entry is not a name, one appears twice, or both arguments are given.
     """
     if tip is not None and tips:
-        raise InvalidValueError("tips", repr(tips)[:80], "none beside tip: name all tips in tips")
+        raise InvalidValueError(
+            "tips", repr(tips)[:80], "nothing, because tip is given: put all tips in tips, or only one in tip"
+        )
     valid = not isinstance(tips, str) and isinstance(tips, Sequence) and all(isinstance(name, str) for name in tips)
     if not valid or len(set(tips)) < len(tips):
         raise InvalidValueError("tips", repr(tips)[:80], "different names of frames")
     return tuple(tips) if tip is None else (tip,)
 
 
-#: arguments and expressions
+#: name -> names of the arguments, and the function that builds the expression
 _FUNCTIONS: dict[str, tuple[tuple[str, ...], Callable[..., ca.SX]]] = {
     "mass_matrix": (("q",), dynamics.build_mass_matrix),
     "gravity": (("q",), dynamics.build_gravity),

@@ -16,26 +16,27 @@ from orthocas.tools.checks import Array, Flags, Indices
 class ShapeRules:
     """Numbers of solids."""
 
-    facets: int = 12  #: of the prism around a cylinder that its bound is made of
-    flat: float = 1e-9  #: [m], of point sets without a volume
-    fan: int = 60  #: triangles of a plane face with which corners may have more neighbours than coal can count, 255
+    facets: int = 12  #: facets of the prism that bounds a cylinder
+    flat: float = 1e-9  #: [m]; thinner point sets have no volume
+    #: triangles of a plane face above which it is split differently: coal counts at most 255 neighbours of a corner
+    fan: int = 60
 
 
 RULES = ShapeRules()
 
 
 class Geometry(Protocol):
-    """What a solid is made of, in its own frame."""
+    """The geometry of a solid in its own frame."""
 
-    reported_first: bool = False  #: whether coal has it first in its answers, whatever is asked
-    knows_clouds: bool = True  #: whether coal has distances of it from point clouds
+    reported_first: bool = False  #: whether coal always reports it as the first of a pair
+    knows_clouds: bool = True  #: whether coal can measure its distance from point clouds
 
     def build(self) -> Any:
-        """The geometry of coal."""
+        """The coal geometry."""
         ...
 
     def list_corners(self) -> tuple[Array, float]:
-        """Points (K, 3) and a radius: the solid lies within the convex hull of the points, rounded by the radius."""
+        """Points (K, 3) and a radius: the solid is within the convex hull of balls of this radius at the points."""
         ...
 
     def contains(self, points: Array) -> Flags:
@@ -45,7 +46,7 @@ class Geometry(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class BoxGeometry(Geometry):
-    """A box with its middle at the origin."""
+    """A box with its centre at the origin."""
 
     size: Array  #: (3,) edge lengths [m]
 
@@ -59,13 +60,13 @@ class BoxGeometry(Geometry):
         return signs * self.size, 0.0
 
     def contains(self, points: Array) -> Flags:
-        """Between all faces."""
+        """Whether points lie between all faces."""
         return np.asarray((np.abs(points) <= self.size / 2).all(axis=1))
 
 
 @dataclass(frozen=True, eq=False)
 class CylinderGeometry(Geometry):
-    """A cylinder along z with its middle at the origin."""
+    """A cylinder along z with its centre at the origin."""
 
     radius: float
     length: float
@@ -90,7 +91,7 @@ class CylinderGeometry(Geometry):
 
 @dataclass(frozen=True, eq=False)
 class EllipsoidGeometry(Geometry):
-    """An ellipsoid with its middle at the origin, and its axes along those of the frame."""
+    """An ellipsoid with its centre at the origin and its axes along those of the frame."""
 
     radii: Array  #: (3,) [m]
     knows_clouds = False
@@ -100,11 +101,11 @@ class EllipsoidGeometry(Geometry):
         return coal.Ellipsoid(*self.radii)
 
     def list_corners(self) -> tuple[Array, float]:
-        """The corners of the box around it."""
+        """The corners of its bounding box."""
         return BoxGeometry(2 * self.radii).list_corners()
 
     def contains(self, points: Array) -> Flags:
-        """Whether points lie within the unit ball, in units of the radii."""
+        """Whether points lie within the unit ball after division by the radii."""
         return np.asarray(np.linalg.norm(points / self.radii, axis=1) <= 1)
 
 
@@ -115,7 +116,7 @@ class BallGeometry(Geometry):
     radius: float
 
     def build(self) -> Any:
-        """The ball, as a capsule without a length: of coal's spheres in cylinders, depths are wrong."""
+        """The ball as a capsule of zero length, because depths of coal's spheres in cylinders are wrong."""
         return coal.Capsule(self.radius, 0.0)
 
     def list_corners(self) -> tuple[Array, float]:
@@ -129,7 +130,7 @@ class BallGeometry(Geometry):
 
 @dataclass(frozen=True, eq=False)
 class CapsuleGeometry(Geometry):
-    """All points within a radius of a segment along z with its middle at the origin."""
+    """All points within a radius of a segment along z with its centre at the origin."""
 
     radius: float
     length: float  #: of the segment [m]
@@ -169,11 +170,12 @@ class HullGeometry(Geometry):
         places = np.zeros(len(points), dtype=np.intp)
         places[hull.vertices] = np.arange(len(hull.vertices))
         corners, faces = points[hull.vertices], places[hull.simplices]
-        # Qhull divides a plane face into a fan from one corner, which then has hundreds of neighbours; halves give few.
+        # Qhull divides a plane face into a fan from one corner, which then has hundreds of neighbours. Repeated halving
+        # gives few.
         _, owners, counts = np.unique(hull.equations, axis=0, return_inverse=True, return_counts=True)
         for face in np.flatnonzero(counts > RULES.fan):
             own = owners.ravel() == face
-            # Its corners in their order along the edge of the face, in the plane of which it lies.
+            # Sort the corners of the face along its boundary, by their angles in the plane of the face.
             ring, normal = np.unique(faces[own]), hull.equations[own][0, :3]
             u, v = ((corners[ring] - corners[ring].mean(axis=0)) @ scipy.linalg.null_space(normal[None])).T
             ring = ring[np.argsort(np.arctan2(v, u))]
@@ -195,7 +197,7 @@ class HullGeometry(Geometry):
         return self.points, 0.0
 
     def contains(self, points: Array) -> Flags:
-        """On the inner side of all faces."""
+        """Whether points are on the inner side of all faces."""
         corners = self.points[self.faces]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
         offsets = np.einsum("fi,fi->f", normals, corners[:, 0])
@@ -204,7 +206,7 @@ class HullGeometry(Geometry):
 
 
 def _halve(ring: NDArray[np.intp]) -> NDArray[np.intp]:
-    """Triangles (K - 2, 3) of a convex polygon (K,), cut in halves: no corner is one of more than 4 log2 K of them."""
+    """Cut a convex polygon (K,) into triangles (K - 2, 3) by halving: a corner is in at most 4 log2 K of them."""
     if len(ring) == 3:
         return ring[None]
     middle = len(ring) // 2
@@ -221,17 +223,17 @@ class HalfSpaceGeometry(Geometry):
         return coal.Halfspace(np.array([0.0, 0.0, 1.0]), 0.0)
 
     def list_corners(self) -> tuple[Array, float]:
-        """None: it has no end."""
+        """No points: it is infinite."""
         return np.zeros((0, 3)), 0.0
 
     def contains(self, points: Array) -> Flags:
-        """Below."""
+        """Whether points are below the plane."""
         return np.asarray(points[:, 2] <= 0)
 
 
 @dataclass(frozen=True, eq=False)
 class CloudGeometry(Geometry):
-    """Cubes of one size on a lattice: those that hold a point of a cloud."""
+    """The cubes of a regular grid that contain a point of a cloud."""
 
     points: Array  #: (N, 3) [m]
     cell: float  #: edge length of the cubes [m]
@@ -242,7 +244,7 @@ class CloudGeometry(Geometry):
         return coal.makeOctree(self.points, self.cell)
 
     def list_corners(self) -> tuple[Array, float]:
-        """The points, with the diagonal of a cube around them."""
+        """The points, with the diagonal of a cube as radius."""
         return self.points, float(np.sqrt(3) * self.cell)
 
     def contains(self, points: Array) -> Flags:
@@ -255,7 +257,7 @@ class CloudGeometry(Geometry):
 
 @dataclass(frozen=True, eq=False)
 class Shape:
-    """A solid somewhere in the frame of a body or of the world."""
+    """A solid placed in the frame of a body or of the world."""
 
     geometry: Geometry
     rotation: Array  #: (3, 3)
@@ -281,7 +283,7 @@ class Shape:
 
     @property
     def bounded(self) -> bool:
-        """Whether it has ends."""
+        """Whether it is bounded."""
         return len(self.geometry.list_corners()[0]) > 0
 
     def bound_by_ball(self) -> tuple[Array, float]:
@@ -295,7 +297,7 @@ class Shape:
     def bound(self) -> tuple[Array, Array, float]:
         """Both ends (3,) and the radius of a capsule that contains it; a point of its surface and 0 for half-spaces.
 
-        Its axis is the one of least volume of those along the principal axes of the corners.
+        Among axes along the principal axes of the corners, it takes the one with the smallest capsule.
         """
         corners, rounding = self.geometry.list_corners()
         if not len(corners):
@@ -304,13 +306,13 @@ class Shape:
         centre = corners.mean(axis=0)
         best: tuple[float, Array, Array, float] | None = None
         for axis in np.linalg.svd(corners - centre)[2] if len(corners) > 1 else np.eye(3)[:1]:
-            # The middle of the corners across the axis, and their distances from a line through it.
+            # Centre of the corners across the axis, and their distances from a line through this centre.
             across = corners - np.outer(corners @ axis, axis)
             middle = (across.min(axis=0) + across.max(axis=0)) / 2
             middle = middle - (middle @ axis) * axis
             away = np.linalg.norm(across - middle, axis=1)
             radius = float(away.max())
-            # Every corner lies within the radius of the segment from low to high.
+            # The segment from low to high has every corner within the radius.
             depth, along = np.sqrt(np.maximum(radius**2 - away**2, 0.0)), corners @ axis
             low, high = float((along + depth).min()), float((along - depth).max())
             low, high = (low, high) if low < high else ((low + high) / 2, (low + high) / 2)
@@ -332,7 +334,7 @@ def read_mesh(file: Path, scale: Array) -> tuple[Array, Indices]:
         mesh: Any = coal.MeshLoader().load(str(file), scale)
     except RuntimeError as error:
         raise ValueError(str(error)) from None
-    # coal's arrays belong to the mesh, and end with it.
+    # coal's arrays are views of the mesh and become invalid with it.
     vertices = np.array(mesh.vertices(), dtype=float).reshape(-1, 3)
     faces = np.array([[t[0], t[1], t[2]] for t in map(mesh.tri_indices, range(mesh.num_tris))], dtype=np.intp)
     if not (len(faces) and np.isfinite(vertices).all()):

@@ -9,10 +9,11 @@ from numpy.typing import ArrayLike
 from orthocas.errors import InvalidValueError
 from orthocas.tools.checks import Array, freeze_array
 
-_TINY = 1e-24  #: under square roots, so that their derivatives are finite
+_TINY = 1e-24  #: added under square roots to keep their derivatives finite
 _EXACTLY = 1e-9  #: error of R R^T up to which a rotation stays as it is
-_NEARLY = 1e-3  #: the same, up to which the nearest rotation takes its place
-_ROUNDING = 1e-14  #: entries of rotations this close to 0 or +-1 are rounding of rpy -> matrix
+_NEARLY = 1e-3  #: error of R R^T up to which the nearest rotation takes its place
+#: entries of rotations this close to 0 or +-1 are rounding errors of the conversion from roll, pitch, yaw
+_ROUNDING = 1e-14
 
 
 def skew(v: ca.SX) -> ca.SX:
@@ -34,9 +35,9 @@ def half_angle_vector(R: ca.SX) -> ca.SX:
 
 
 def find_quaternion(R: ca.SX) -> ca.SX:
-    """The unit quaternion (w, x, y, z) of a rotation matrix with w >= 0, without loss of digits, (4, 1).
+    """Unit quaternion (w, x, y, z) of a rotation matrix, with w >= 0 and full accuracy, (4, 1).
 
-    Beyond 120 degrees it is taken from the column of v v^T with the largest diagonal entry, v = (x, y, z).
+    Beyond 120 degrees it comes from the column of v v^T with the largest diagonal entry, v = (x, y, z).
     """
     trace, far = ca.trace(R), ca.SX(4, 1)
     # 4 v_k^2
@@ -56,13 +57,13 @@ def find_quaternion(R: ca.SX) -> ca.SX:
 
 
 def multiply_quaternions(a: ca.SX, b: ca.SX) -> ca.SX:
-    """a b of quaternions (w, x, y, z), (4, 1)."""
+    """Product a b of quaternions (w, x, y, z), (4, 1)."""
     v, u = a[1:], b[1:]
     return ca.vertcat(a[0] * b[0] - ca.dot(v, u), a[0] * u + b[0] * v + ca.cross(v, u))
 
 
 def conjugate(a: ca.SX) -> ca.SX:
-    """The conjugate of a quaternion (w, x, y, z), the inverse of a unit one."""
+    """Conjugate of a quaternion (w, x, y, z); for a unit quaternion, its inverse."""
     return ca.vertcat(a[0], -a[1:])
 
 
@@ -83,14 +84,14 @@ def tilt(R: ca.SX, axis: int, to_differentiate: bool = False) -> ca.SX:
     Args:
         R: the rotation matrix.
         axis: number of the axis.
-        to_differentiate: use the formula without cases, which loses digits next to half a turn.
+        to_differentiate: use the formula without case distinctions, which loses digits near half a turn.
     """
     d = R[:, axis]
     across = d[[k for k in range(3) if k != axis]]
     factor = ca.sqrt(2 / (1 + d[axis]))
     if to_differentiate:
         return across * factor
-    # Beyond a quarter of a turn.
+    # Formula beyond a quarter of a turn.
     beyond = ca.sqrt(2 * (1 - d[axis]) / ca.fmax(ca.sumsqr(across), _TINY))
     return across * ca.if_else(d[axis] < 0, beyond, factor)
 
@@ -98,9 +99,9 @@ def tilt(R: ca.SX, axis: int, to_differentiate: bool = False) -> ca.SX:
 def turn_about(R: ca.SX, axis: int) -> ca.SX:
     """Angle of a rotation matrix about one of its own axes, after the shortest rotation that tilts that axis.
 
-    R = S T, where S takes e_axis to R e_axis about an axis across both, and T turns about e_axis by the angle
-    atan2(R_ji - R_ij, R_ii + R_jj) in (-pi, pi], with (i, j, axis) in cyclic order. Singular where S is half a turn;
-    2 atan2(p_axis, p_w) of the quaternion p loses fewer digits next to it.
+    R = S T. S takes e_axis to R e_axis about an axis perpendicular to both. T turns about e_axis by the angle
+    atan2(R_ji - R_ij, R_ii + R_jj) in (-pi, pi], with (i, j, axis) in cyclic order. The angle is singular where S is
+    half a turn. Near that, 2 atan2(p_axis, p_w) of the quaternion p is more accurate.
     """
     i, j = (axis + 1) % 3, (axis + 2) % 3
     return ca.atan2(R[j, i] - R[i, j], R[i, i] + R[j, j])
@@ -118,7 +119,7 @@ def rotation_matrix(name: str, value: ArrayLike) -> Array:
         ShapeError, InvalidValueError: if it is off by more than 1e-3.
     """
     rotation = freeze_array(name, value, (3, 3))
-    # Products of larger numbers may overflow.
+    # Larger entries are no rotation, and their products may overflow.
     bounded = np.abs(rotation).max() < 2
     error = float(np.abs(rotation @ rotation.T - np.eye(3)).max()) if bounded else np.inf
     if not error < _NEARLY or np.linalg.det(rotation) < 0:
@@ -140,6 +141,6 @@ def rotate_z_to(axis: Array) -> Array:
 
 
 def snap(values: Array) -> Array:
-    """Replace entries that are 0 or +-1 up to rounding by these, so that CasADi drops the terms."""
+    """Replace entries within rounding of 0 or +-1 by these values, so that CasADi drops the terms."""
     rounded = np.round(values)
     return np.where(np.abs(values - rounded) < _ROUNDING, rounded, values) + 0.0

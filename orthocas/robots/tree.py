@@ -1,4 +1,4 @@
-"""The numbers of a kinematic tree: Pinocchio's robot as plain data, which chart files store."""
+"""The numbers of a kinematic tree: a robot of Pinocchio as plain data, which chart files store."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field, fields, replace
@@ -17,13 +17,14 @@ from orthocas.tools.display import listed
 class TreeRules:
     """Bounds and tolerances of the numbers of a robot."""
 
-    joints: int = 150  #: the work for a mass matrix grows with their square
-    frames: int = 1000  #: of a robot that anybody has
+    joints: int = 150  #: largest number of joints: the cost of a mass matrix grows with its square
+    frames: int = 1000  #: largest number of frames, more than any robot has
     largest: float = 1e30  #: larger numbers overflow in products
-    not_turned: float = 1e-6  #: |R R^T - 1| of a rotation in single precision
-    symmetric: float = 1e-6  #: of the largest entry of an inertia
-    indefinite: float = 0.1  #: of the largest entry: identified inertias in published robot files have -0.07
-    no_inertia: float = 1e-9  #: [kg m^2]
+    not_turned: float = 1e-6  #: largest entry of |R R^T - 1|, for rotations in single precision
+    symmetric: float = 1e-6  #: allowed asymmetry of an inertia, relative to its largest entry
+    #: allowed negative moment, relative to the largest entry: identified inertias in robot files have -0.07
+    indefinite: float = 0.1
+    no_inertia: float = 1e-9  #: [kg m^2], allowed negative moment of bodies without inertia
 
 
 RULES = TreeRules()
@@ -59,7 +60,7 @@ class KinematicTree:
     are S q + s_0. Without mimic joints N = n, and parents come before children.
 
     Raises:
-        ShapeError, InvalidValueError, UnknownNameError, RobotError: for numbers and names that no robot has.
+        ShapeError, InvalidValueError, UnknownNameError, RobotError: for numbers or names that no robot has.
     """
 
     joint_names: tuple[str, ...]
@@ -85,9 +86,9 @@ class KinematicTree:
     frame_parents: tuple[int, ...] = ()  #: bodies that carry them, -1 for the base
     frame_rotations: Array = field(default_factory=lambda: np.zeros((0, 3, 3)))  #: (k, 3, 3) in the body's frame
     frame_translations: Array = field(default_factory=lambda: np.zeros((0, 3)))  #: (k, 3) [m]
-    mimic_names: tuple[str, ...] = ()  #: of N - n joints that follow others
+    mimic_names: tuple[str, ...] = ()  #: names of the N - n joints that follow others
     mimic_kinds: tuple[JointKind, ...] = ()
-    mimic_leaders: tuple[int, ...] = ()  #: the joints of the n that they follow
+    mimic_leaders: tuple[int, ...] = ()  #: indices of the joints that they follow, below n
     mimic_factors: Array = field(default_factory=lambda: np.zeros(0))  #: (N - n,)
     mimic_offsets: Array = field(default_factory=lambda: np.zeros(0))  #: (N - n,) [rad] or [m]
 
@@ -127,7 +128,6 @@ class KinematicTree:
             require_shape(name, limits.shape, (n,))
             limits.setflags(write=False)
             object.__setattr__(self, name, limits)
-        # Each mimic joint follows one of the n joints.
         for name in ("mimic_kinds", "mimic_leaders"):
             require_shape(name, (len(getattr(self, name)),), (bodies - n,))
         for j, leader in enumerate(self.mimic_leaders):
@@ -150,13 +150,13 @@ class KinematicTree:
         require_text("tip_name", self.tip_name)
         for i, kind in enumerate(self.body_kinds):
             require_known("joint kind", kind, JOINT_KINDS)
-            # A mimic joint may carry joints that come before it.
+            # A mimic joint may carry joints with smaller indices.
             _require_index(f"parents[{i}]", self.parents[i], self.bodies - 1 if self.mimic_names else i - 1)
             _require_rotation(f"rotations[{i}]", self.rotations[i])
         if len(self.order) < self.bodies:
-            raise RobotError("the joints hang on each other in a loop, expected a tree")
+            raise RobotError("the joints carry each other in a loop, expected a tree")
         for i, name in enumerate(self.joint_names):
-            # A joint can be somewhere, and move.
+            # The range of a joint must not be empty.
             lower, upper = self.lower[i], self.upper[i]
             if not lower <= upper or lower == np.inf or upper == -np.inf:
                 raise RobotError(f"joint '{name}' has limits [{lower:g}, {upper:g}], expected lower <= upper")
@@ -177,14 +177,14 @@ class KinematicTree:
             _require_rotation(f"frame_rotations[{k}]", self.frame_rotations[k])
         for tip in self.tips:
             require_known("tip", tip, self.frame_names)
-        # The links of each body name it in errors.
+        # Error messages name a body by its links.
         frames = list(zip((self.tip_name, *self.frame_names), (self.tip_parent, *self.frame_parents), strict=True))
         for i, name in enumerate(self.body_joints):
             links = [frame for frame, parent in frames if parent == i]
             require_body(name, self.masses[i], self.inertias[i], self.armatures[i], links)
 
     def equals(self, other: "KinematicTree") -> bool:
-        """Whether all names and numbers are the same, as those of one file that was read twice are."""
+        """Whether all names and numbers are equal, as for one file that was read twice."""
         return other is self or all(np.array_equal(getattr(self, f.name), getattr(other, f.name)) for f in fields(self))
 
     @property
@@ -205,7 +205,7 @@ class KinematicTree:
         return Frame(name, self.frame_parents[k], self.frame_rotations[k], self.frame_translations[k])
 
     def carriers(self, body: int) -> list[int]:
-        """A body and those that carry it, from the base on; none for -1. Bodies from n on are those of mimic joints."""
+        """The bodies from the base to a body, both included; none for -1. Bodies from n on belong to mimics."""
         chain = []
         while body >= 0:
             chain.append(body)
@@ -214,12 +214,12 @@ class KinematicTree:
 
     @property
     def n(self) -> int:
-        """Number of joints that move by themselves."""
+        """Number of independent joints."""
         return len(self.joint_names)
 
     @property
     def bodies(self) -> int:
-        """Number N of joints with mimic joints, and of the bodies that they move."""
+        """Number N of joints including mimic joints, which is also the number of bodies."""
         return len(self.joint_names) + len(self.mimic_names)
 
     @property
@@ -234,7 +234,7 @@ class KinematicTree:
 
     @property
     def leaders(self) -> tuple[int, ...]:
-        """The joint by whose coordinate each body moves, (N,)."""
+        """Index of the coordinate that moves each body, (N,)."""
         return (*range(self.n), *self.mimic_leaders)
 
     @property
@@ -246,7 +246,7 @@ class KinematicTree:
 
     @property
     def order(self) -> tuple[int, ...]:
-        """The bodies that hang on the base, parents before children."""
+        """All bodies, parents before children."""
         if not self.mimic_names:
             return tuple(range(self.n))
         placed: list[int] = []
@@ -257,7 +257,7 @@ class KinematicTree:
         return tuple(placed)
 
     def expand(self, q: Any) -> Any:
-        """S q + s_0, the positions of all joints: of SX or MX (n, 1), or of arrays (n,) or (K, n)."""
+        """S q + s_0, the positions of all joints; q is SX or MX (n, 1), or an array (n,) or (K, n)."""
         if not self.mimic_names:
             return q
         leaders, offsets = list(self.leaders), np.concatenate([np.zeros(self.n), self.mimic_offsets])
@@ -267,10 +267,10 @@ class KinematicTree:
         return q[..., leaders] * factors + offsets
 
     def require_no_mimics(self, what: str) -> None:
-        """Raise RobotError if a joint mimics another one, for what is not possible with such joints."""
+        """Raise RobotError if the robot has mimic joints, for an operation that does not support them."""
         if self.mimic_names:
             joint, leader = self.mimic_names[0], self.joint_names[self.mimic_leaders[0]]
-            raise RobotError(f"{what}: not possible with mimic joints, and '{joint}' mimics '{leader}'")
+            raise RobotError(f"{what}: not possible with mimic joints; here '{joint}' mimics '{leader}'")
 
     @property
     def centre_posture(self) -> Array:
@@ -286,7 +286,7 @@ class KinematicTree:
         return np.asarray(posture)
 
     def draw_postures(self, count: int, seed: int) -> Array:
-        """Uniform postures between the limits, (count, n); joints without limits take a turn, or half a metre."""
+        """Uniform postures between the limits, (count, n). Unlimited joints take a whole turn, or half a metre."""
         width = np.where(self.prismatic, 2 * PRISMATIC_ROOM, 2 * np.pi)
         upwards = np.where(np.isfinite(self.upper), self.upper - width, -width / 2)
         low = np.where(np.isfinite(self.lower), self.lower, upwards)
@@ -330,10 +330,10 @@ def require_body(joint: str, mass: float, inertia: Array, armature: float, links
     size = float(np.abs(inertia).max())
     smallest = float(np.linalg.eigvalsh((inertia + inertia.T) / 2)[0])
     symmetric = np.abs(inertia - inertia.T).max() <= RULES.symmetric * size
-    # rounding in files may leave a moment a little below zero
+    # Rounding in files may make a moment slightly negative.
     if mass >= 0 and armature >= 0 and symmetric and smallest >= -RULES.indefinite * size - RULES.no_inertia:
         return
-    # what is wrong, of which body
+    # Report what is wrong, and with which body.
     body = f"the body moved by joint '{joint}'{f' ({listed(links)})' if links else ''}"
     if mass < 0:
         raise RobotError(f"{body} has mass {mass:g} kg, expected >= 0")
@@ -348,7 +348,7 @@ def require_driven(what: str, tree: KinematicTree) -> None:
     """Raise RobotError for a robot with a floating base, whose first joints no motor drives."""
     if tree.floating:
         raise RobotError(
-            f"{what} needs joints that motors drive, and no motor drives a floating base. Charts of it have fits, "
+            f"{what} needs driven joints, but no motor drives a floating base. Charts of it support fit, "
             "evaluation and inverse; Robot.zero_momentum has what moves the base"
         )
 
@@ -364,7 +364,7 @@ def set_gravity(tree: KinematicTree, gravity: ArrayLike | None) -> KinematicTree
         return tree
     vector = freeze_array("gravity", gravity, (3,))
     if tree.floating and vector.any():
-        raise RobotError(f"gravity is {vector.tolist()}, expected none: a base that nothing holds has no gravity")
+        raise RobotError(f"gravity is {vector.tolist()}, expected zeros: a floating base has no gravity")
     return replace(tree, gravity=vector)
 
 
@@ -378,8 +378,8 @@ _BASES: dict[str, tuple[str, ...]] = {
     "floating": _FLOATING,
     "floating:xy": _AFLOAT,
 }
-_AXES = {"heading": "z", "yaw": "z", "pitch": "y", "roll": "x"}  #: of joints that turn
-BASE_JOINTS = tuple({joint for joints in _BASES.values() for joint in joints})  #: that a moving base may have
+_AXES = {"heading": "z", "yaw": "z", "pitch": "y", "roll": "x"}  #: rotation axes of the base's turning joints
+BASE_JOINTS = tuple({joint for joints in _BASES.values() for joint in joints})  #: all joint names of moving bases
 
 
 def place_on_base(tree: KinematicTree, base: str, mass: float, centre: Array, inertia: Array) -> KinematicTree:
@@ -392,8 +392,8 @@ def place_on_base(tree: KinematicTree, base: str, mass: float, centre: Array, in
     Args:
         tree: the robot on a fixed base.
         base: "planar", "rail:x", "rail:y", "rail:z", "floating", or "floating:xy".
-        mass: of what the base carries and no joint of the robot moves [kg].
-        centre: its centre of mass, (3,) [m].
+        mass: mass of the base itself, that is of all links that no joint of the robot moves [kg].
+        centre: centre of that mass, (3,) [m].
         inertia: about that centre, (3, 3) [kg m^2].
 
     Raises:
@@ -406,7 +406,7 @@ def place_on_base(tree: KinematicTree, base: str, mass: float, centre: Array, in
     names = _BASES[base]
     moves = [name.rpartition("_")[2] for name in names]
     joint_kinds: list[JointKind] = ["revolute" if move in _AXES else "prismatic" for move in moves]
-    # Rotations by which z becomes the axis of each joint, and back from the world's axes to those of the last body.
+    # Rotations that bring z onto the axis of each joint, and back from the world's axes to those of the last body.
     along = [np.roll(np.eye(3), 2 - "xyz".index(_AXES.get(move, move)), axis=1) for move in moves]
     k, back = len(names), along[-1].T
     free, first = np.full(k, np.inf), np.zeros((k, 3))
@@ -415,7 +415,7 @@ def place_on_base(tree: KinematicTree, base: str, mass: float, centre: Array, in
         return body + k
 
     def turn_base(rotations: Array, translations: Array, parents: tuple[int, ...]) -> tuple[Array, Array]:
-        """Frames of the base in axes of the last body that moves it."""
+        """Frames of the bodies on the base, in axes of the last body that moves the base."""
         on_base = np.array([parent < 0 for parent in parents], dtype=bool)
         turned = np.where(on_base[:, None, None], back @ rotations, rotations)
         return turned, np.where(on_base[:, None], translations @ back.T, translations)

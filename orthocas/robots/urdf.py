@@ -1,4 +1,4 @@
-"""URDF and SRDF files: bounded XML, checks for errors that Pinocchio's parser accepts, and reading."""
+"""Reads URDF and SRDF files, with limits on size and with checks for errors that Pinocchio's parser accepts."""
 
 import logging
 import math
@@ -28,40 +28,41 @@ from orthocas.tools.checks import Array
 from orthocas.tools.display import listed
 
 _log = logging.getLogger(__name__)
-_PACKAGES = Lock()  #: held while xacrodoc looks for packages, which it does in one place for all
+_PACKAGES = Lock()  #: held while xacrodoc looks for packages, because its list of packages is global
 
 
 @dataclass(frozen=True, slots=True)
 class FileRules:
-    """Bounds of robot files: more than any robot has, and little enough for any machine."""
+    """Limits on robot files: above what any robot has, and low enough for any machine."""
 
-    bytes: int = 16 * 2**20  #: of a file
-    elements: int = 200_000  #: of a file, including the files that it includes
-    depth: int = 200  #: of nested elements
+    bytes: int = 16 * 2**20  #: size of a file
+    elements: int = 200_000  #: elements of a file, including its included files
+    depth: int = 200  #: depth of nested elements
     links: int = 1000  #: links (URDF) or bodies (MJCF) of a robot
-    largest: float = 1e20  #: number of an axis or of a mimic joint
-    inertia: float = 1e-2  #: of the largest moment, by which files round
-    least_inertia: float = 1e-5  #: [kg m^2], which dummies have
-    shortest_axis: float = 1e-12  #: length of the vector along an axis
+    largest: float = 1e20  #: largest number in an axis or a mimic element
+    inertia: float = 1e-2  #: tolerance of the triangle inequality for rounded files, relative to the largest moment
+    least_inertia: float = 1e-5  #: [kg m^2], further tolerance, for dummy inertias
+    shortest_axis: float = 1e-12  #: shortest vector that is accepted as an axis
 
 
 RULES = FileRules()
 _NUMBER = re.compile(r"[-+]?(\d+\.?\d*|\.\d+)([eE][-+]?\d+)?", re.ASCII)
 _ARTICLE = {"URDF": "a", "xacro": "a", "MJCF": "an", "SRDF": "an"}
-_XACRO = ("}macro", "}property", "}include", "}arg", "}if", "}unless", "}insert_block", "}element")  #: beside calls
-#: what kinematics and dynamics use of a file
+#: elements of xacro other than calls of macros
+_XACRO = ("}macro", "}property", "}include", "}arg", "}if", "}unless", "}insert_block", "}element")
+#: elements that kinematics and dynamics use
 _USED = {"link": ("inertial",), "joint": ("origin", "parent", "child", "axis", "limit", "mimic")}
-#: urdfdom's last words on every joint, which say nothing
+#: last line of urdfdom's message on every joint, without information
 _CONTEXT = "joint xml is not initialized correctly"
 
 
 def read_urdf(path: str | Path) -> tuple[pin.Model, dict[str, Mimic]]:
-    """Read a URDF file: all joints as independent ones, and which of them follow others.
+    """Read a URDF file: a model with all joints independent, and the mimic joints.
 
-    Only what kinematics and dynamics use is read: links, their inertias, and joints. Faults elsewhere, such as in
-    shapes and colours, are logged. So are missing limits of effort and velocity, which count as unlimited.
+    Only what kinematics and dynamics need is read: links, their inertias, and joints. Errors elsewhere, such as in
+    shapes and colours, are logged. Missing limits of effort and velocity are logged too; they count as unlimited.
 
-    Joints that mimic a fixed joint, or with the multiplier 0, are locked at their offset.
+    Joints that mimic a fixed joint, or have the multiplier 0, are locked at their offset.
 
     Raises:
         RobotError: if the file is missing or not a URDF model, a joint has a zero axis, or joints mimic each other in a
@@ -71,8 +72,8 @@ def read_urdf(path: str | Path) -> tuple[pin.Model, dict[str, Mimic]]:
     _check_macros(path, root)
     _add_lost_root(path, root)
 
-    # Missing limits of effort and velocity become 0, which means unlimited, as does -1 in some files. Joints without
-    # any limit become unlimited.
+    # Missing limits of effort and velocity become 0, which means unlimited, and so does -1, which some files use.
+    # Joints without a limit element become unlimited.
     unlimited = []
     for joint in root.findall("joint"):
         if joint.get("type") in ("revolute", "prismatic") and joint.find("limit") is None:
@@ -82,7 +83,7 @@ def read_urdf(path: str | Path) -> tuple[pin.Model, dict[str, Mimic]]:
             limit.attrib.update(dict.fromkeys(missing, "0"))
             unlimited += [joint.get("name", "")] if missing else []
 
-    # Links, inertias and joints are checked and read without the rest of the file.
+    # Build a document of links, inertias and joints only, and check and read it.
     used = ElementTree.Element("robot", name=root.get("name") or "robot")
     for element in root:
         if element.tag in _USED:
@@ -107,9 +108,9 @@ def read_urdf(path: str | Path) -> tuple[pin.Model, dict[str, Mimic]]:
 
 @contextmanager
 def _own_packages(expander: Any, path: Path) -> Iterator[None]:
-    """Let xacrodoc find the ROS packages that lie in the same folder as the package of a file.
+    """Let xacrodoc find the ROS packages in the same folder as the package of a file.
 
-    What it finds for one file is not kept for others: two workspaces may have packages of one name.
+    The packages found for one file are not kept for others, because two workspaces may have packages of one name.
     """
     root = next((folder for folder in path.parents if (folder / "package.xml").exists()), None)
     beside = [] if root is None else [str(found.parent) for found in sorted(root.parent.glob("*/package.xml"))]
@@ -120,7 +121,7 @@ def _own_packages(expander: Any, path: Path) -> Iterator[None]:
         expander.packages._finder = own
         try:
             if beside:
-                # after what the user and ROS name
+                # Lowest priority: names that come from the user or from ROS come first.
                 expander.packages.look_in(beside, priority=sys.maxsize)
             yield
         finally:
@@ -128,17 +129,17 @@ def _own_packages(expander: Any, path: Path) -> Iterator[None]:
 
 
 def read_urdf_xml(path: str | Path) -> ElementTree.Element:
-    """The root element of a URDF file; xacro files, whose names end in .xacro, are run through xacro first.
+    """The root element of a URDF file; files whose names end in .xacro are first expanded by xacro.
 
-    xacrodoc or xacro has to be installed for these. They run expressions that the file holds.
+    This needs xacrodoc or xacro, and runs expressions in the file.
 
     Raises:
-        RobotError: as in `read_xml`; if xacro is missing, or fails.
+        RobotError: as in `read_xml`; also if xacro is missing or fails.
     """
     if Path(path).suffix.lower() != ".xacro":
         return read_xml(path, "URDF", "robot")
     read_xml(path, "xacro")
-    # xacrodoc finds packages above and beside that of the file; xacro alone comes with ROS.
+    # xacrodoc finds packages above and beside the file's own. Plain xacro comes with ROS.
     name = next((name for name in ("xacrodoc", "xacro") if find_spec(name) is not None), None)
     if name is None:
         raise RobotError(f"{path} is a xacro file, which xacro expands first: pip install 'orthocas[xacro]'")
@@ -149,7 +150,7 @@ def read_urdf_xml(path: str | Path) -> ElementTree.Element:
                 text = expander.XacroDoc.from_file(str(path)).to_urdf_string()
         else:
             text = expander.process_file(str(path)).toxml()
-    # Files raise whatever their expressions do.
+    # Expressions in the file may raise any error.
     except (Exception, SystemExit) as error:
         missing = re.search(r"[Pp]ackage not found: (\S+)", str(error))
         if missing:
@@ -170,11 +171,11 @@ def read_xml(path: str | Path, kind: str, tag: str | None = None, data: bytes | 
         path: the file.
         kind: expected kind of file for messages, "URDF", "xacro", "MJCF" or "SRDF".
         tag: expected name of the root element. None allows any name.
-        data: what a program made of the file, in place of its content.
+        data: bytes to parse in place of the file's content, such as the output of xacro.
 
     Raises:
-        RobotError: if the file is missing, is not XML, has another root element, declares a document type (entities
-            could fill the memory), or is larger or deeper than any robot.
+        RobotError: if the file is missing, is not XML, has another root element, declares a document type (whose
+            entities could fill the memory), or is larger or deeper than any robot file.
     """
     try:
         if data is None:
@@ -187,7 +188,7 @@ def read_xml(path: str | Path, kind: str, tag: str | None = None, data: bytes | 
         root: ElementTree.Element = parser.close()
     except OSError as error:
         raise RobotError(f"cannot read {kind} file {path}: {error.strerror}") from None
-    # LookupError stands for an unknown encoding.
+    # LookupError: unknown encoding.
     except (ElementTree.ParseError, LookupError, ValueError) as error:
         raise RobotError(f"{path} is not {_ARTICLE[kind]} {kind} file: {error}") from None
     if tag is not None and root.tag != tag:
@@ -220,13 +221,13 @@ class _BoundedBuilder(ElementTree.TreeBuilder):
 
 
 def _check_macros(path: str | Path, root: ElementTree.Element) -> None:
-    """Refuse xacro files by another name, and log calls of macros that the file does not have."""
-    # Parsers of URDF skip macros without a word. Some files of generators still have calls of macros that they lost.
+    """Refuse xacro files with another ending, and log calls of macros that the file does not define."""
+    # URDF parsers skip macros silently. Files from some generators still contain calls of macros that were lost.
     macros = [element for element in root.iter() if element.tag.startswith("{") and "xacro}" in element.tag]
     names = (element.get("name", "") for kind in ("link", "joint") for element in root.iter(kind))
     if any(macro.tag.endswith(_XACRO) for macro in macros) or any("${" in name for name in names):
         raise RobotError(
-            f"{path} is a xacro file, expected URDF: name it .xacro if you trust it, since xacro runs what is in it"
+            f"{path} is a xacro file, expected URDF: if you trust it, rename it to .xacro; xacro runs the code in it"
         )
     if macros:
         lost = listed(dict.fromkeys(macro.tag.rpartition("}")[2] for macro in macros), 3)
@@ -234,7 +235,7 @@ def _check_macros(path: str | Path, root: ElementTree.Element) -> None:
 
 
 def _add_lost_root(path: str | Path, root: ElementTree.Element) -> None:
-    """Add the link that all others hang on, if joints name it and the file lacks it: a part for another robot."""
+    """Add the root link if joints name it and the file lacks it, as in files that are parts of another robot."""
     links = {link.get("name", "") for link in root.findall("link")}
     parents = {end.get("link", "") for end in root.iterfind("joint/parent")}
     children = {end.get("link", "") for end in root.iterfind("joint/child")}
@@ -245,15 +246,14 @@ def _add_lost_root(path: str | Path, root: ElementTree.Element) -> None:
 
 
 def _check_urdf(path: str | Path, root: ElementTree.Element) -> None:
-    """Refuse zero axes, negative limits and masses, what is not a tree, and more links than any robot has.
+    """Refuse zero axes, negative limits and masses, kinematic loops, and more links than any robot has.
 
     Pinocchio's parser checks lengths of vectors, numbers and limits.
     """
-    # Bodies, then joints, then how they hang together.
     links = root.findall("link")
     if len(links) > RULES.links:
         raise RobotError(f"{path} has {len(links)} links, expected at most {RULES.links}")
-    # Names before anything else: every message below speaks of links and joints by name.
+    # Check names first, because every message below uses names.
     names = [link.get("name", "") for link in links]
     for i, (name, link) in enumerate(zip(names, links, strict=True)):
         if not name or name in names[:i]:
@@ -267,14 +267,14 @@ def _check_urdf(path: str | Path, root: ElementTree.Element) -> None:
 
 
 def _note_impossible_inertias(path: str | Path, root: ElementTree.Element) -> None:
-    """Log links with a principal moment that is negative, or larger than the sum of the others: no body has these."""
+    """Log links with a principal moment that is negative or larger than the sum of the others: no body has these."""
     odd = []
     for link in root.findall("link"):
         inertia = link.find("inertial/inertia")
         if inertia is not None:
             values = (float(inertia.get(name, 0)) for name in ("ixx", "iyy", "izz", "ixy", "ixz", "iyz"))
             xx, yy, zz, xy, xz, yz = values
-            # a mass distribution has moments that fulfil the triangle inequality
+            # Moments of a mass distribution fulfil the triangle inequality.
             moments = np.linalg.eigvalsh([[xx, xy, xz], [xy, yy, yz], [xz, yz, zz]])
             slack = RULES.inertia * np.abs(moments).max() + RULES.least_inertia
             if moments[0] < -slack or moments[2] > moments[0] + moments[1] + slack:
@@ -284,7 +284,7 @@ def _note_impossible_inertias(path: str | Path, root: ElementTree.Element) -> No
 
 
 def _check_joint(path: str | Path, joint: ElementTree.Element) -> None:
-    """The axis is a direction, limits of effort and velocity are not negative, and a mimic joint follows by numbers."""
+    """Check that the axis is not zero, that limits are not negative, and that mimic elements hold numbers."""
     name, axis, limit = joint.get("name"), joint.find("axis"), joint.find("limit")
     if axis is not None and joint.get("type") in ("revolute", "continuous", "prismatic"):
         if (text := axis.get("xyz")) is None:
@@ -292,19 +292,19 @@ def _check_joint(path: str | Path, joint: ElementTree.Element) -> None:
         words, unfit = text.split(), f"{path}: xyz of <axis> of joint '{name}' is '{text[:80]}', expected"
         if len(words) != 3 or not all(_NUMBER.fullmatch(word) for word in words):
             raise RobotError(f"{unfit} 3 numbers")
-        # Squares of numbers in words may overflow, unlike their hypotenuse.
+        # The square of a large number may overflow; math.hypot does not.
         length = math.hypot(*map(float, words))
         if not length <= RULES.largest:
             raise RobotError(f"{unfit} 3 numbers up to {RULES.largest:g}")
         if length < RULES.shortest_axis:
             raise RobotError(f"{unfit} a vector that is not zero")
-    # Pinocchio's parser refuses some negative limits, and names no joint.
+    # Pinocchio's parser refuses some negative limits, but does not name the joint.
     for what in ("effort", "velocity"):
         text = "" if limit is None else limit.get(what, "")
         if _read_number(text) < 0:
             label = f"<limit> of joint '{name}'"
             raise RobotError(f"{path}: {what} of {label} is '{text[:80]}', expected a number >= 0 (0: unlimited)")
-    # It does not read mimic elements here.
+    # Pinocchio's parser does not read mimic elements here.
     for mimic, what in product(joint.findall("mimic"), ("multiplier", "offset")):
         text = mimic.get(what, "0").strip()
         if not _NUMBER.fullmatch(text) or abs(float(text)) > RULES.largest:
@@ -313,7 +313,7 @@ def _check_joint(path: str | Path, joint: ElementTree.Element) -> None:
 
 
 def _read_number(text: str) -> float:
-    """The number of a text, NaN for others: to refuse them is left to Pinocchio's parser."""
+    """Convert a text to a number; NaN if it is none, which Pinocchio's parser then refuses."""
     try:
         return float(text)
     except ValueError:
@@ -321,14 +321,14 @@ def _read_number(text: str) -> float:
 
 
 def _check_tree(path: str | Path, root: ElementTree.Element) -> None:
-    """Every joint connects two links of the file, every link but one hangs on one joint, and all hang on that one."""
+    """Check that joints connect links of the file, and that the links form one tree."""
     joints, names = [], [link.get("name", "") for link in root.findall("link")]
     for joint in root.findall("joint"):
         ends = (joint.find(end) for end in ("parent", "child"))
         parent, child = ("" if end is None else end.get("link", "") for end in ends)
         joints.append((joint.get("name", ""), parent, child))
     children: dict[str, list[str]] = {}
-    #: of a link: the joint that it hangs on
+    #: link -> the joint that carries it
     carriers: dict[str, str] = {}
     for name, parent, child in joints:
         for end, link in (("parent", parent), ("child", child)):
@@ -343,11 +343,11 @@ def _check_tree(path: str | Path, root: ElementTree.Element) -> None:
             )
         carriers[child] = name
         children.setdefault(parent, []).append(child)
-    # Parsers would take one of several roots, and drop the other trees without a word.
+    # Parsers would choose one of several roots and drop the other trees silently.
     roots = [link for link in names if link not in carriers]
     if len(roots) > 1:
         raise RobotError(f"{path}: the links '{roots[0]}' and '{roots[1]}' hang on no joint, expected one such link")
-    # What no walk from the roots reaches hangs in a loop.
+    # Links that no path from a root reaches are in a loop.
     reached = list(roots)
     for link in reached:
         reached += children.get(link, ())
@@ -360,10 +360,10 @@ def _check_tree(path: str | Path, root: ElementTree.Element) -> None:
 
 
 def _parse_urdf(text: str) -> tuple[pin.Model, str]:
-    """The model that Pinocchio reads from a text, and what is wrong with it: "" if nothing.
+    """The model that Pinocchio reads from a text, and an error message, "" if nothing is wrong.
 
-    The parser goes on after many errors and skips what it cannot read, for example a mass. It writes them to standard
-    error, which is captured here: they belong in our message, from the outermost element to the fault in it.
+    The parser continues after many errors and skips what it cannot read, for example a mass. It writes these errors to
+    standard error. They are captured here and joined into one message, from the outermost element inwards.
     """
     model, words, saved = pin.Model(), "", os.dup(2)
     with tempfile.TemporaryFile() as notes:
@@ -371,7 +371,7 @@ def _parse_urdf(text: str) -> tuple[pin.Model, str]:
         try:
             model = pin.buildModelFromXML(text, mimic=False)
         except (ValueError, RuntimeError) as error:
-            # Without its place in the C++ source.
+            # Remove the location in the C++ source.
             words = one_line(str(error).rpartition("message:")[2])
         finally:
             os.dup2(saved, 2)
@@ -385,14 +385,14 @@ def _parse_urdf(text: str) -> tuple[pin.Model, str]:
 
 
 def _read_mimics(model: pin.Model, root: ElementTree.Element) -> tuple[pin.Model, dict[str, Mimic]]:
-    """The joints of a model that follow others, with the independent leader of each: leaders may follow others.
+    """The mimic joints of a model, each with its independent leader, and the model with immobile joints locked.
 
-    Joints that follow a fixed joint, or with the factor 0, are locked in the model that is returned.
+    Joints that mimic a fixed joint, or have the factor 0, are locked in the returned model.
 
     Raises:
         RobotError: if joints follow each other in a loop.
     """
-    # pin reads mimic joints as free ones, so the file is asked.
+    # Pinocchio reads mimic joints as independent ones, so read them from the file.
     direct = {
         joint.get("name", ""): Mimic(
             mimic.get("joint", ""), float(mimic.get("multiplier", 1)), float(mimic.get("offset", 0))
@@ -401,7 +401,7 @@ def _read_mimics(model: pin.Model, root: ElementTree.Element) -> tuple[pin.Model
         for mimic in joint.findall("mimic")
     }
     mimics = {name: mimic for name, mimic in resolve_mimics(direct).items() if model.existJointName(name)}
-    # those that never move
+    # Joints that never move.
     fixed = {joint.get("name", "") for joint in root.findall("joint") if joint.get("type") == "fixed"}
     still = [name for name, mimic in mimics.items() if mimic.leader in fixed or not mimic.factor]
     position, ids = pin.neutral(model), [model.getJointId(name) for name in still]
@@ -422,7 +422,7 @@ def read_srdf_postures(urdf: Path, joint_names: Sequence[str]) -> dict[str, Arra
     if path is None:
         return {}
     states: dict[str, dict[str, float]] = {}
-    # numbers only: values of joints with several are left out
+    # Skip values of joints with several degrees of freedom, which are not single numbers.
     for state in read_xml(path, "SRDF", "robot").iter("group_state"):
         joints = states.setdefault(state.get("name", ""), {})
         for joint in state.iter("joint"):
@@ -442,7 +442,7 @@ _DATA = "example-robot-data"
 
 
 def list_robot_files() -> dict[str, Path]:
-    """The URDF files of example-robot-data by name: their stems, 'ur5' for ur5_robot.urdf."""
+    """URDF files of example-robot-data by robot name, for example 'ur5' for ur5_robot.urdf."""
     try:
         found = [Path(str(file.locate())) for file in files(_DATA) or () if file.suffix == ".urdf"]
     except PackageNotFoundError:
@@ -454,11 +454,10 @@ def list_robot_files() -> dict[str, Path]:
 def find_robot_file(name: str) -> Path:
     """The URDF file of a robot's name, such as 'panda'.
 
-    example-robot-data comes first. robot_descriptions, if it is installed, downloads a description when it is asked for
-    it the first time.
+    example-robot-data comes first. robot_descriptions, if installed, downloads a description on first use.
 
     Raises:
-        UnknownNameError: if no installed package knows the name; the error has the known ones.
+        UnknownNameError: if no installed package knows the name. The message lists the known names.
     """
     known = list_robot_files()
     if name in known:

@@ -1,4 +1,4 @@
-"""Steps of disturbances and references of a run, and files that list them."""
+"""Pushes, friction, stops and noise of a run, and files with the steps of its reference."""
 
 from __future__ import annotations
 
@@ -41,37 +41,39 @@ _WITH_POINTS = ("points", "start", "pushes")
 class SimulationRules:
     """Numbers of simulations."""
 
-    tolerance: float = 1e-8  #: relative and absolute, of the integrators
-    outputs: int = 25  #: instants a call of an integrator: one integrator serves all, and Ctrl-C waits for one call
-    ticks: int = 50  #: a call, for the same reason
-    same_time: float = 1e-9  #: events closer than this differ only by rounding [s]
-    most_steps: int = 100_000  #: of the physics in a tick, about 5 s of computing
-    most_ticks: float = 1e7  #: of a sampled run
-    most_instants: float = 1e6  #: of a run that is read from a file
-    shortest: float = 1e-3  #: time between points, and length of a run or a push [s]
-    stribeck_speed: float = 0.05  #: at which a joint that breaks away rubs less [rad/s] or [m/s]
-    stiction_speed: float = 0.01  #: above twice this, Coulomb friction is nearly at its full value [rad/s] or [m/s]
-    beyond: float = 1e-3  #: a joint limit: stops give way a little [rad] or [m]
-    lasting: float = 0.1  #: at the limit, from which on the storage must not rise [s]
+    tolerance: float = 1e-8  #: relative and absolute tolerance of the integrators
+    #: instants per call of an integrator, so that one integrator serves all runs, and Ctrl-C waits for one call only
+    outputs: int = 25
+    ticks: int = 50  #: ticks per call, for the same reason
+    same_time: float = 1e-9  #: [s]; events closer than this are simultaneous up to rounding
+    most_steps: int = 100_000  #: most physics steps in a tick, about 5 s of computing
+    most_ticks: float = 1e7  #: most ticks of a sampled run
+    most_instants: float = 1e6  #: most instants of a run that a file defines
+    shortest: float = 1e-3  #: [s], shortest spacing of points, run and push
+    #: default Stribeck speed, at which friction falls from breakaway to Coulomb [rad/s] or [m/s]
+    stribeck_speed: float = 0.05
+    stiction_speed: float = 0.01  #: [rad/s] or [m/s]; above twice this speed, Coulomb friction is nearly complete
+    beyond: float = 1e-3  #: [rad] or [m] beyond a joint limit that counts as outside, because stops give way a little
+    lasting: float = 0.1  #: [s] of saturation after which the storage must not have risen
     no_step: float = 1e-9  #: smaller differences of targets are rounding
 
-    steps_file: int = 2**23  #: bytes of a steps file
-    largest: float = 1e6  #: of its numbers; larger ones are mistakes and would overflow later
-    longest: int = 80  #: most characters of it that an error repeats
+    steps_file: int = 2**23  #: largest size of a steps file [bytes]
+    largest: float = 1e6  #: largest number in it; larger ones are mistakes and would overflow later
+    longest: int = 80  #: most characters of the file that an error repeats
 
 
 RULES = SimulationRules()
 
 
 class Place(NamedTuple):
-    """A point of a body."""
+    """A point fixed in a body."""
 
     body: int  #: index of the joint that moves it, -1 for the base
     point: tuple[float, float, float]  #: in the frame of the body in `KinematicTree` [m]
 
 
 def place_of(tree: KinematicTree, link: Link, point: Array) -> Place:
-    """The place of a point (3,) in the frame of a link, or of the tip.
+    """Convert a point (3,) in the frame of a link, or of the tip, to a place on a body.
 
     Raises:
         UnknownNameError, InvalidValueError: if the robot has no such link.
@@ -91,7 +93,7 @@ def place_of(tree: KinematicTree, link: Link, point: Array) -> Place:
 
 
 def require_link(link: object, n: int | None = None) -> None:
-    """Raise InvalidValueError unless the link is a name, None, or an index (of n joints, if n is known)."""
+    """Raise InvalidValueError unless the link is a name, None, or an index (below n, if n is given)."""
     if link is None or isinstance(link, str):
         return
     whole = isinstance(link, int | np.integer) and not isinstance(link, bool)
@@ -101,9 +103,9 @@ def require_link(link: object, n: int | None = None) -> None:
 
 
 def count_steps(seconds: float, longest: float) -> int:
-    """The number of equal steps of the physics in a tick [s], none longer than a length [s].
+    """The number of equal physics steps in a tick [s], none longer than a given length [s].
 
-    A tick that is a whole number of such steps, but for rounding, gets no further one.
+    If the tick is a multiple of this length up to rounding, no further step is added.
     """
     count = as_number("seconds", seconds) / longest - 1e-9
     if not -1e-9 < count <= RULES.most_steps:
@@ -113,17 +115,17 @@ def count_steps(seconds: float, longest: float) -> int:
 
 @dataclass(frozen=True, eq=False)
 class Push:
-    """An external load that is constant for some time.
+    """An external load that is constant over an interval of time.
 
     Args:
         start: [s], >= 0.
         duration: [s], > 0.
         force: in world axes, (3,) [N]; default no force.
         torque: at the joints, (n,) [N m] or [N]; default no torque.
-        link: where the force acts: a link, by the name or the index of the joint that moves it, or a frame of the robot
-            by its name; default the tip.
-        point: where on the link, in its frame, (3,) [m]. Frames of links are those of `Robot.tree`: the origin is on
-            the joint's axis, which is z.
+        link: link where the force acts: name or index of the joint that moves it, or name of a frame of the robot.
+            Default: the tip.
+        point: point of the link where the force acts, in the link's frame, (3,) [m]. Frames of links are those of
+            `Robot.tree`: the origin lies on the joint's axis, which is z.
     """
 
     start: float
@@ -142,7 +144,7 @@ class Push:
         link: Link = None,
         point: ArrayLike = (0.0, 0.0, 0.0),
     ) -> None:
-        # Two instants, then forces, and where the force acts.
+        # Check the times, then force and torque, then the place of the force.
         object.__setattr__(self, "start", require_at_least("start of a push", start, 0))
         object.__setattr__(self, "duration", require_positive("duration of a push", duration))
         object.__setattr__(self, "force", freeze_array("force", force, (3,)))
@@ -157,7 +159,7 @@ class Push:
         return self.start + self.duration
 
     def load(self, n: int) -> Array:
-        """Force and joint torques in one row, (3 + n,)."""
+        """Force and joint torques as one row, (3 + n,)."""
         torque = np.zeros(n) if self.torque is None else self.torque
         require_shape("torque of a push", torque.shape, (n,))
         return np.concatenate([self.force, torque])
@@ -165,17 +167,18 @@ class Push:
 
 @dataclass(frozen=True, eq=False)
 class Friction:
-    """Joint friction tau_f = viscous dq + F(dq) sign(dq), which opposes the motion, after Stribeck.
+    """Joint friction tau_f = viscous dq + F(dq) sign(dq), which opposes the motion (Stribeck model).
 
-    F(v) = coulomb + (breakaway - coulomb) exp(-(v / stribeck_speed)^2) is the size of the dry friction: a joint breaks
-    away at more than it rubs with. At rest, any torque up to the breakaway torque is held exactly by `StickingPlant`;
-    with CVODES, sign(v) is tanh(v / 0.01), so that joints creep. MuJoCo has no Stribeck friction.
+    F(v) = coulomb + (breakaway - coulomb) exp(-(v / stribeck_speed)^2) is the dry friction: it is largest at breakaway,
+    and falls to the Coulomb friction with speed. `StickingPlant` holds a joint at rest exactly under any torque up to
+    the breakaway torque. CVODES replaces sign(v) by tanh(v / 0.01), so joints creep. MuJoCo has no Stribeck friction.
 
     Args:
         viscous: >= 0, (n,) or one number [N m s/rad].
         coulomb: >= 0, (n,) or one number [N m].
         breakaway: >= coulomb, (n,) or one number [N m]; default coulomb.
-        stribeck_speed: > 0, at which friction falls from the one to the other, (n,) or one number [rad/s] or [m/s].
+        stribeck_speed: > 0, speed scale of the fall from breakaway to Coulomb friction, (n,) or one number [rad/s] or
+            [m/s].
     """
 
     viscous: ArrayLike = 0.0
@@ -184,7 +187,7 @@ class Friction:
     stribeck_speed: ArrayLike = RULES.stribeck_speed
 
     def numbers(self, n: int) -> Array:
-        """Viscous friction, Coulomb friction, breakaway minus Coulomb friction, Stribeck speed of n joints, (4 n,)."""
+        """Viscous, Coulomb, and breakaway minus Coulomb friction, and Stribeck speed of n joints, (4 n,)."""
         viscous, coulomb = (non_negative_gains(name, getattr(self, name), n) for name in ("viscous", "coulomb"))
         breakaway = coulomb if self.breakaway is None else non_negative_gains("breakaway", self.breakaway, n)
         if (breakaway < coulomb).any():
@@ -194,7 +197,7 @@ class Friction:
 
     @staticmethod
     def torque(dq: ca.SX, numbers: ca.SX) -> ca.SX:
-        """Friction torque, to be subtracted from the joint torque, (n, 1), for `numbers` as a column (4 n, 1)."""
+        """Friction torque, to subtract from the joint torque, (n, 1); `numbers` is a column (4 n, 1)."""
         viscous, coulomb, extra, speed = ca.vertsplit(numbers, dq.shape[0])
         size = coulomb + extra * ca.exp(-((dq / speed) ** 2))
         friction: ca.SX = viscous * dq + size * ca.tanh(dq / RULES.stiction_speed)
@@ -203,7 +206,7 @@ class Friction:
 
 @dataclass(frozen=True, eq=False)
 class Stops:
-    """Joint stops tau_s = -stiffness p max(0, 1 + damping dp/dt), where p is how far a joint is beyond its limit.
+    """Joint stops tau_s = -stiffness p max(0, 1 + damping dp/dt), with p the penetration of the joint limit.
 
     The damping grows with p, as in the contact model of Hunt and Crossley, so the torque is continuous and never pulls.
 
@@ -217,7 +220,7 @@ class Stops:
 
     def torque(self, tree: KinematicTree, q: ca.SX, dq: ca.SX) -> ca.SX:
         """Torque of the stops on the joints, (n, 1)."""
-        # A spring and a damper at each finite limit, which push and never pull.
+        # A spring and a damper at each finite limit, which only push.
         stiffness = positive_gains("stiffness of stops", self.stiffness, tree.n)
         damping = non_negative_gains("damping of stops", self.damping, tree.n)
         torque = ca.SX(tree.n, 1)
@@ -231,12 +234,12 @@ class Stops:
 
 @dataclass(frozen=True)
 class Noise:
-    """White Gaussian noise on the measurements of the controller, drawn anew at every control tick.
+    """White Gaussian noise on the controller's measurements, drawn at every control tick.
 
     Args:
         position: standard deviation >= 0 [rad] or [m].
         velocity: standard deviation >= 0 [rad/s] or [m/s].
-        seed: of the random numbers.
+        seed: seed of the random numbers.
     """
 
     position: float = 0.0
@@ -255,7 +258,7 @@ class Noise:
 
 
 class Loads:
-    """The pushes of a run, as rows [force at each of P places (3 P); torque of the joints (n)].
+    """The pushes of a run as rows: forces at each of P places (3 P), then joint torques (n).
 
     Raises:
         UnknownNameError, InvalidValueError, ShapeError: if a push does not fit the robot.
@@ -265,7 +268,7 @@ class Loads:
         self.pushes = tuple(pushes)
         self._tree = tree
         self._places_of_pushes = [place_of(tree, push.link, push.point) for push in self.pushes]
-        self._rows  # noqa: B018 (refuses torques of other robots at once)
+        self._rows  # noqa: B018 (checks the torques now)
 
     @cached_property
     def places(self) -> tuple[Place, ...]:
@@ -278,7 +281,7 @@ class Loads:
         return 3 * len(self.places) + self._tree.n
 
     def shares(self, starts: Array, length: float) -> Array:
-        """How much of each interval of equal length each push lasts, (N, pushes): short pushes keep their impulses."""
+        """Fraction of each interval of equal length that each push covers, (N, pushes); this keeps impulses."""
         shares = [
             np.maximum(np.minimum(starts + length, push.end) - np.maximum(starts, push.start), 0.0) / length
             for push in self.pushes
@@ -318,14 +321,14 @@ class Plan:
     reference: Reference  #: in phi = [x; xi], with the labels of the chart
     q_start: Array  #: (n,) [rad] or [m]
     pushes: tuple[Push, ...]
-    has_steps: bool  #: whether the reference consists of steps rather than points
+    has_steps: bool  #: whether the reference consists of steps instead of points
 
 
 def read_steps(path: str | Path, chart: Chart) -> Plan:
-    """Read a steps file for a chart. Does not check that the reference is reachable.
+    """Read a steps file for a chart, without checking that the reference is reachable.
 
     Raises:
-        StepsFileError: names the file, the place in it, the value there and what was expected.
+        StepsFileError: names the file, the place in it, the value there and the expected value.
     """
     reader = Reader(Path(path))
     data = reader.parsed()
@@ -337,7 +340,7 @@ def read_steps(path: str | Path, chart: Chart) -> Plan:
     has_steps = "steps" in data
     where = "the object with 'steps'" if has_steps else "the object with 'points'"
     reader.fields(data, where, _WITH_STEPS if has_steps else _WITH_POINTS)
-    # The motion begins at the centre of the domain, or where the file says.
+    # The motion starts at the home of the domain, or where the file says.
     q_start = chart.problem.domain.home
     if "start" in data:
         q_start = reader.numbers(data["start"], "start", chart.n)
@@ -345,7 +348,7 @@ def read_steps(path: str | Path, chart: Chart) -> Plan:
         reference = (_read_step_reference if has_steps else _read_point_reference)(
             reader, data, chart.labels, chart.phi(q_start)
         )
-        # A file may ask for more than a computer has room for.
+        # Refuse files whose runs would exceed the memory.
         instants = reference.duration / reference.spacing
         if instants > RULES.most_instants:
             raise reader.fault(
@@ -360,11 +363,11 @@ def read_steps(path: str | Path, chart: Chart) -> Plan:
 
 
 def _read_step_reference(reader: Reader, data: Mapping[str, Any], labels: tuple[str, ...], start: Array) -> Reference:
-    # The time that the run takes, and the filter that rounds its steps off.
+    # Duration of the run, and frequency of the filter that smooths the steps.
     duration = reader.number(data.get("duration"), "duration", least=RULES.shortest)
     frequency = reader.number(data.get("natural_frequency", NATURAL_FREQUENCY), "natural_frequency", above=0.0)
     ratio = reader.number(data.get("damping_ratio", DAMPING_RATIO), "damping_ratio", least=0.0)
-    # Steps in their order; quantities that a step does not name keep their targets.
+    # Read the steps in order. Quantities that a step does not name keep their targets.
     changes, before = [], 0.0
     targets = dict(zip(labels, start.tolist(), strict=True))
     for k, entry in enumerate(reader.items(data["steps"], "steps")):
@@ -395,20 +398,20 @@ def _read_point_reference(reader: Reader, data: Mapping[str, Any], labels: tuple
 def _read_change(
     reader: Reader, data: object, where: str, before: Mapping[str, float]
 ) -> tuple[float, dict[str, float]]:
-    """Time and targets of one step or point. Quantities that it does not name keep their previous targets."""
+    """Time and targets of one step or point. Quantities that it does not name keep their targets."""
     entry = reader.fields(data, where, ("time", "move", "to"))
     targets, named = dict(before), set()
     for key in ("move", "to"):
         for label, value in reader.fields(entry.get(key, {}), f"{where}.{key}", before, "quantity").items():
             if label in named:
-                raise reader.fault(f"{where} has {label} in 'move' and in 'to', expected it in one of them")
+                raise reader.fault(f"{where} has {label} in both 'move' and 'to', expected it in only one")
             named.add(label)
             targets[label] = reader.number(value, f"{where}.{key}.{label}") + (before[label] if key == "move" else 0.0)
     return reader.number(entry.get("time"), f"{where}.time", least=0.0), targets
 
 
 def _read_pushes(reader: Reader, data: object, joint_names: tuple[str, ...], run_ends: float) -> tuple[Push, ...]:
-    """Pushes on links or the tip (a force at a point) or on joints (a torque)."""
+    """Read pushes: a force at a point of a link or the tip, or a torque on the joints."""
     pushes = []
     for k, item in enumerate(reader.items(data, "pushes")):
         where = f"pushes[{k}]"
@@ -421,10 +424,10 @@ def _read_pushes(reader: Reader, data: object, joint_names: tuple[str, ...], run
         duration = reader.number(entry.get("duration"), f"{where}.duration", least=RULES.shortest)
         force = reader.numbers(entry.get("force", [0.0] * 3), f"{where}.force", 3)
         torque = reader.numbers(entry.get("torque", [0.0] * len(joint_names)), f"{where}.torque", len(joint_names))
-        # The force acts at a point in the frame of a link, or of the tip.
+        # A force acts at a point of a link, or of the tip.
         for key in ("link", "point"):
             if key in entry and "force" not in entry:
-                raise reader.fault(f"{where} has a '{key}' but no 'force', expected both or none of them")
+                raise reader.fault(f"{where} has a '{key}' but no 'force', expected 'force' too, or no '{key}'")
         link = entry.get("link")
         whole = isinstance(link, int) and not isinstance(link, bool) and 0 <= link < len(joint_names)
         if "link" in entry and not whole and link not in joint_names:
@@ -448,14 +451,14 @@ class Reader:
                 content = stream.read(RULES.steps_file + 1)
         except OSError as error:
             raise self.fault(f"cannot be read, {error.strerror}") from None
-        # ValueError stands for a path with a zero.
+        # ValueError: the path contains a null character.
         except ValueError as error:
             raise self.fault(f"cannot be read, {error}") from None
         if len(content) > RULES.steps_file:
-            raise self.fault(f"larger than {RULES.steps_file / 2**20:.0f} MiB, no steps file")
+            raise self.fault(f"larger than {RULES.steps_file / 2**20:.0f} MiB, which is too large for a steps file")
         try:
             return read_strict_json(content.decode("utf-8-sig"))
-        # ValueError also stands for bytes that are no text.
+        # ValueError: not JSON, or bytes that are not text.
         except ValueError as error:
             raise self.fault(f"truncated or not JSON, {str(error)[: RULES.longest]}") from None
 
@@ -468,7 +471,7 @@ class Reader:
         return self.fault(f"{where} is {json.dumps(got)[: RULES.longest]}, expected {want}")
 
     def fields(self, data: object, where: str, known: Collection[str], what: str = "key") -> dict[str, Any]:
-        """An object that has only known keys."""
+        """Return the data if it is an object with known keys only."""
         if not isinstance(data, dict):
             raise self.wrong(where, data, "an object")
         for key in data:
@@ -478,13 +481,13 @@ class Reader:
         return data
 
     def items(self, data: object, where: str) -> list[Any]:
-        """Return the data if it is a list; raise otherwise."""
+        """Return the data if it is a list."""
         if not isinstance(data, list):
             raise self.wrong(where, data, "a list")
         return data
 
     def number(self, data: object, where: str, least: float = -RULES.largest, above: float = -inf) -> float:
-        """A number that is at least `least` or above `above`, and at most 1e6."""
+        """Return a number that is at least `least` or above `above`, and at most 1e6."""
         if data is None:
             raise self.fault(f"{where} is missing, expected a number")
         low = f"above {above:g}" if isfinite(above) else f"from {least:g}"
@@ -497,7 +500,7 @@ class Reader:
         return float(data)
 
     def numbers(self, data: object, where: str, length: int) -> Array:
-        """A list of finite numbers, (length,)."""
+        """Return a list of finite numbers as an array (length,)."""
         items = self.items(data, where)
         if len(items) != length:
             raise self.wrong(where, items, f"a list of {length} numbers")

@@ -41,12 +41,13 @@ class PictureRules:
     """Numbers of figures and animations of runs."""
 
     font: float = 8.0  #: [pt]
-    narrowest: float = 1e-2  #: range of a panel, relative to the widest, so that a quantity at rest looks at rest
-    width: float = 8.6  #: of an animation [inch]
+    #: smallest range of a panel, relative to the widest, so that a constant quantity looks constant
+    narrowest: float = 1e-2
+    width: float = 8.6  #: width of an animation [inch]
     dpi: int = 100
     panel: float = 0.66  #: height of a quantity's panel [inch]
     margin: float = 0.08  #: around the arm, as a fraction of the widest range
-    flat: float = 1e-9  #: range of a coordinate of a planar arm [m]
+    flat: float = 1e-9  #: [m], largest extent of a planar arm across its plane
     rate: int = 20  #: frames per second
     most_frames: int = 400  #: longer runs play faster than real time
     colours: int = 128
@@ -64,7 +65,7 @@ def units_of(problem: Problem) -> dict[str, str]:
 
 
 def trajectory_figure(trajectory: "Trajectory", units: Mapping[str, str] | None = None) -> Figure:
-    """Draw controlled quantities on the left; joints, commands and storage on the right. Red: not the law.
+    """Draw controlled quantities on the left; joints, commands and storage on the right. Red: fallback, not the law.
 
     Args:
         trajectory: the run.
@@ -74,14 +75,14 @@ def trajectory_figure(trajectory: "Trajectory", units: Mapping[str, str] | None 
     figure = Picture(figsize=(10.5, max(5.4, 1.05 * k + 0.9)), layout="constrained")
     halves: Any = figure.subfigures(1, 2)
     left, right = halves
-    # On the left, each controlled quantity with its target and its largest error.
+    # Left: each controlled quantity with its target and its largest error.
     units = units or {}
     quantities = left.subplots(k, 1, sharex=True, squeeze=False)[:, 0]
     draw_quantities(quantities, trajectory, units)
     for axes, label, worst in zip(quantities, trajectory.labels, trajectory.tracking_error, strict=True):
         axes.set_title(f"largest error {worst:.2g} {units.get(label, '')}", loc="right", fontsize=7.5, pad=2)
     quantities[0].legend(fontsize=RULES.font, loc="lower left", bbox_to_anchor=(0, 1), ncols=2, frameon=False)
-    # On the right joints, commands and, for torques, the storage.
+    # Right: joints, commands and, for torques, the storage.
     others = right.subplots(2 + (trajectory.kind == "torque"), 1, sharex=True)
     _draw_others(others, trajectory, units)
     for axes in (*quantities, *others):
@@ -108,7 +109,7 @@ def draw_quantities(panels: Array, trajectory: "Trajectory", units: Mapping[str,
         axes.plot(trajectory.times, trajectory.reference[:, i], "--", color=_REFERENCE, linewidth=1, label="reference")
         axes.set_ylim(middles[i] - 0.58 * spans[i], middles[i] + 0.58 * spans[i])
         unit = f" [{units[label]}]" if label in units else ""
-        # xi1 as a mathematical symbol; other labels unchanged.
+        # Write xi1 as a mathematical symbol; leave other labels unchanged.
         number = label.removeprefix("xi")
         symbol = rf"$\xi_{{{number}}}$" if label.startswith("xi") and number.isdigit() else label
         axes.set_ylabel(f"{symbol}{unit}", fontsize=9)
@@ -116,7 +117,7 @@ def draw_quantities(panels: Array, trajectory: "Trajectory", units: Mapping[str,
 
 
 def shade_fallback(axes: Axes, trajectory: "Trajectory") -> None:
-    """Shade in red where the controller used its fallback."""
+    """Shade in red the times at which the controller used its fallback."""
     edges = np.flatnonzero(np.diff(trajectory.status)) + 1
     for start, end in zip([0, *edges], [*edges, len(trajectory.times) - 1], strict=True):
         status = ControlStatus(int(trajectory.status[start]))
@@ -126,12 +127,11 @@ def shade_fallback(axes: Axes, trajectory: "Trajectory") -> None:
 
 def _draw_others(panels: Array, trajectory: "Trajectory", units: Mapping[str, str]) -> None:
     """Draw joints, commands and, for torque controllers, the storage."""
-    # Units of joints that turn, slide, or both.
+    # The unit depends on whether joints turn, slide, or both.
     torque = trajectory.kind == "torque"
     unit = " or ".join(sorted({units.get(name, "rad or m") for name in trajectory.joint_names}, reverse=True))
     force = " or ".join({"rad": "N m", "m": "N"}[part] for part in unit.split(" or "))
     speed = " or ".join(f"{part}/s" for part in unit.split(" or "))
-    # Joints and commands, and for torques the storage of the law.
     panels[0].plot(trajectory.times, trajectory.q, linewidth=1.3, label=trajectory.joint_names)
     panels[0].set_ylabel(f"joints q [{unit}]", fontsize=9)
     names = len(trajectory.joint_names)
@@ -154,7 +154,7 @@ def _set_style(axes: Axes, trajectory: "Trajectory") -> None:
 
 
 def _build_title(trajectory: "Trajectory") -> str:
-    # How the run ended, then how long something other than the law was in charge, and how long it was cut.
+    # State how the run ended, for how long the fallback was active, and for how long the command was limited.
     text = f"{trajectory.controller}, {trajectory.times[-1]:.4g} s"
     if trajectory.outcome.value != "complete":
         text += f": {trajectory.outcome.value}, {trajectory.reason or 'run ended early'}"
@@ -172,7 +172,7 @@ def _format_durations(lasting: Mapping[ControlStatus, float], chosen: Sequence[C
 
 
 class MovingPicture:
-    """Draws the moving parts over a background that is drawn once, so that a frame takes milliseconds.
+    """Draws moving parts over a background that is drawn once, so that a frame takes milliseconds.
 
     Args:
         trajectory: the run.
@@ -203,7 +203,7 @@ class MovingPicture:
         handles = [self._lines[0], *panels[0].lines[:1]]
         figure.legend(handles=handles, loc=(0.605, 1 - 0.34 / height), **_LEGEND)
         self.title = trajectory.controller + ("" if speed == 1 else f", {speed:.3g} x real time")
-        self.axes = tuple(figure.axes)  #: the axes of the arm, then those of each quantity
+        self.axes = tuple(figure.axes)  #: axes of the arm, then of each quantity
         figure.text(0.02, 1 - 0.25 / height, self.title, fontsize=10)
         self._clock = figure.text(0.42, 1 - 0.25 / height, "", fontsize=10, animated=True)
         self._canvas.draw()
@@ -213,7 +213,7 @@ class MovingPicture:
         """Frames of the run at the given instants, by index."""
         for index in instants:
             self._canvas.restore_region(self._background)
-            # All that moves, placed as it is at the instant, over the background.
+            # Draw everything that moves at this instant over the background.
             now = self._times[index]
             for i in range(self._values.shape[1]):
                 done, cursor = self._lines[2 * i : 2 * i + 2]
@@ -231,12 +231,12 @@ class _Arm:
     def __init__(self, figure: Figure, trajectory: "Trajectory", problem: Problem) -> None:
         points = problem.robot.joint_points(trajectory.q)  # (N, points, 3)
         low, high = points.min(axis=(0, 1)), points.max(axis=(0, 1))
-        # Planar arms lie in two axes.
+        # A planar arm gets two axes.
         flat = np.flatnonzero(high - low < RULES.flat)
         shown = np.delete(np.arange(3), flat[-1]) if flat.size else np.arange(3)
         axes = _build_axes(figure, low[shown], high[shown], ["xyz"[i] for i in shown])
         self._points, self._targets = points[..., shown], _compute_tip_targets(trajectory, problem)[:, shown]
-        # The base stands still; path, arm and target are placed anew in each picture.
+        # The base is fixed; path, arm and target move in each frame.
         zero = np.zeros((len(shown), 0))
         axes.plot(*self._points[0, :1].T, "s", color=_ARM, markersize=9)
         self._lines: list[Any] = [
@@ -249,7 +249,7 @@ class _Arm:
         figure.legend(handles=known[: 1 + np.isfinite(self._targets).all()], loc=(0.02, 0.01), **_LEGEND)
 
     def moved(self, index: int) -> list[Artist]:
-        """The lines, placed as they are at an instant."""
+        """The lines, moved to their positions at an instant."""
         now = self._points[index]
         shapes = [self._points[: index + 1, -1], now, self._targets[index : index + 1]]
         for line, shape in zip(self._lines, shapes, strict=True):
@@ -260,7 +260,7 @@ class _Arm:
 
 
 def _compute_tip_targets(trajectory: "Trajectory", problem: Problem) -> Array:
-    """Target of the tip, (N, 3). Axes that the task leaves free follow the tip; NaN if the task is not its position."""
+    """Target of the tip, (N, 3), equal to the tip along free axes; NaN if the task is not a position."""
     if not problem.task.of_tip or not problem.task.name.startswith("position:"):
         return np.full((len(trajectory.times), 3), np.nan)
     target = problem.robot.joint_points(trajectory.q)[:, -1].copy()
@@ -275,7 +275,7 @@ def _build_axes(figure: Figure, low: Array, high: Array, names: list[str]) -> An
     centres, extent = (low + high) / 2, high - low + 2 * RULES.margin * longest
     if len(names) == 2:
         axes: Any = figure.add_axes((0.075, 0.17, 0.445, 0.74))
-        # One scale for both axes, whatever the shape of the panel.
+        # Use one scale for both axes, whatever the shape of the panel.
         shape = figure.get_size_inches() * axes.get_position().size
         extent = (extent / shape).max() * shape
         axes.grid(alpha=0.3)
@@ -293,7 +293,7 @@ def _build_axes(figure: Figure, low: Array, high: Array, names: list[str]) -> An
 
 
 def require_format(name: str) -> None:
-    """Check early that an animation of this format can be made on this machine.
+    """Check early that this machine can make an animation of this format.
 
     Raises:
         UnknownNameError: if the format is neither gif nor mp4.
@@ -307,28 +307,29 @@ def require_format(name: str) -> None:
 def save_animation(
     path: str | Path, trajectory: "Trajectory", problem: Problem, monitor: Monitor = silent, force: bool = False
 ) -> None:
-    """Write an animation of the arm and its controlled quantities. The file appears whole or not at all.
+    """Write an animation of the arm and its controlled quantities. The file appears complete or not at all.
 
-    The arm is drawn in 3-D, or in its plane if it is planar. The animation has 20 frames per second and runs in real
-    time for runs of up to 20 s.
+    The arm is drawn in 3-D, or in its plane if it is planar. The animation has 20 frames per second. Runs of up to 20 s
+    play in real time.
 
     Args:
-        path: of the file, ending in .gif or .mp4.
+        path: output file, ending in .gif or .mp4.
         trajectory: the run.
         problem: robot and task.
-        monitor: called with progress.
-        force: replace any file of that name; default only those that the list `.orthocas.json` of the folder has, which
-            is kept there.
+        monitor: receives progress.
+        force: replace any file of that name. Default: replace only files listed in `.orthocas.json` of the folder,
+            which `save_animation` maintains.
 
     Raises:
         UnknownNameError, InvalidValueError: if the format is unknown, or ffmpeg is missing.
-        ArchiveError: if the file cannot be written, or there is one that orthocas did not write, or a symbolic link.
+        ArchiveError: if the file cannot be written, or the path is a symbolic link or a file that orthocas did not
+            write.
     """
     target = Path(path)
     require_format(target.suffix.removeprefix("."))
     require_writable(target, ArchiveError)
     require_replaceable_files(target.parent, [target.name], force)
-    # Frames at instants of the run, which plays faster than real time if it is long.
+    # Choose the instants of the frames; long runs play faster than real time.
     times = trajectory.times
     speed = max(1.0, float(times[-1] - times[0]) * RULES.rate / RULES.most_frames)
     shown = np.arange(times[0], times[-1] + 1e-9, speed / RULES.rate)
@@ -346,7 +347,7 @@ def save_animation(
         if target.suffix == ".mp4":
             _write_mp4(draft, draw(), (len(samples) // 2, samples.shape[1]))
             return
-        # All frames in the palette of the samples; each stores only what changes.
+        # Use the palette of sample frames for all frames; each frame stores only changes.
         palette = Image.fromarray(samples).quantize(RULES.colours)
         frames = (Image.fromarray(p).quantize(palette=palette, dither=Image.Dither.NONE) for p in draw())
         first, pause = next(frames), 1000 // RULES.rate
@@ -362,7 +363,7 @@ def _write_mp4(path: Path, pictures: Iterator[Frame], size: tuple[int, int]) -> 
     with tempfile.TemporaryFile() as said:
         ffmpeg = subprocess.Popen(command, stdin=subprocess.PIPE, stdout=said, stderr=said)
         try:
-            # If ffmpeg gives up, its messages say why.
+            # If ffmpeg stops early, its messages state the reason.
             with suppress(BrokenPipeError), ffmpeg:
                 assert ffmpeg.stdin is not None
                 for picture in pictures:

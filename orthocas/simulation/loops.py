@@ -1,4 +1,4 @@
-"""Closed loops in continuous time and tick by tick: in CVODES, compiled C and MuJoCo, and with the supervised law."""
+"""Closed loops in continuous time and tick by tick: in CVODES, compiled C and MuJoCo, and with supervised laws."""
 
 import logging
 from collections.abc import Callable, Hashable, Iterator, Sequence
@@ -30,8 +30,9 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-KEPT = 32  #: functions of each kind that a process remembers
-#: span [s], start of the reference's segment [s], its parameters, load, state -> states at 25 equally spaced instants
+KEPT = 32  #: functions of each kind that a process caches
+#: (begin, end) [s], start of the reference's segment [s], its parameters, load, state -> states at 25 equally spaced
+#: instants
 Integrator = Callable[[tuple[float, float], float, Array, Array, Array], Array]
 #: state; references with derivatives (N, 3 k), noise and loads of N ticks -> states after them, commands, status (N, 1)
 Ticks = Callable[..., tuple[Array, Array, Array]]
@@ -54,7 +55,7 @@ class ClosedLoop:
 
     @property
     def size(self) -> int:
-        """Numbers of a state."""
+        """Size of the state."""
         return 2 * self.n if self.torque else self.n
 
     @property
@@ -64,7 +65,7 @@ class ClosedLoop:
 
     @property
     def stiff(self) -> bool:
-        """Whether friction or stops make an implicit method necessary."""
+        """Whether friction or stops require an implicit method."""
         return self.stops is not None or bool(self.friction.numbers(self.n)[self.n : 3 * self.n].any())
 
     @cached_property
@@ -77,7 +78,7 @@ class ClosedLoop:
 
     @property
     def plant_of_numbers(self) -> ca.Function:
-        """The same with `plant_numbers` as a fourth input: one function for robots and friction of any amounts."""
+        """`plant_rate` with `plant_numbers` as a fourth input: one function serves all masses and frictions."""
         n = self.n
         q, dq, command, load = (
             ca.SX.sym(name, size) for name, size in (("q", n), ("dq", n), ("u", n), ("load", self.loads.size))
@@ -98,7 +99,7 @@ class ClosedLoop:
 
     @property
     def plant_numbers(self) -> Array:
-        """Amounts of friction, if there is any, then the inertial parameters of the robot."""
+        """Amounts of friction, if any, then the inertial parameters of the robot."""
         if not self.torque:
             return np.zeros(0)
         inertials = dynamics.collect_inertials(self.plant.tree)
@@ -120,7 +121,7 @@ class ClosedLoop:
 
     @property
     def rubs(self) -> bool:
-        """Whether there is friction."""
+        """Whether the plant has friction."""
         return bool(self.friction.numbers(self.n)[: 3 * self.n].any())
 
     def commanded(self, state: ca.MX, reference: Sequence[ca.MX]) -> tuple[ca.MX, ca.MX]:
@@ -131,9 +132,9 @@ class ClosedLoop:
         return command, status
 
     def rate(self, reference: Reference) -> ca.Function:
-        """state, time since the start of a segment, parameters of the segment, load -> rate of the state.
+        """state, time since the start of a segment, its parameters, load -> rate of the state.
 
-        A process remembers it, so runs that differ in start, targets or size of loads build it once.
+        The process caches it, so runs that differ only in start, targets or size of loads build it once.
         """
         gains = tuple(gain.tobytes() for gain in self.controller.gains.values())
         plant = (self.plant_key, self.plant_numbers.tobytes())
@@ -142,7 +143,7 @@ class ClosedLoop:
 
 @dataclass(frozen=True)
 class Keyed:
-    """A loop that counts as equal to others with the same key."""
+    """A loop that compares equal to others with the same key."""
 
     key: Hashable
     loop: ClosedLoop = field(compare=False)
@@ -166,11 +167,11 @@ def _build_rate(keyed: Keyed, profile: ca.Function) -> ca.Function:
 
 @dataclass(frozen=True, eq=False)
 class Held:
-    """What a sampled controller said at the start of each of N ticks."""
+    """Outputs of a sampled controller at the start of each of N ticks."""
 
     commands: Array  #: (N, n), held until the end of the tick
     status: Array  #: (N,)
-    cause: Array  #: (N,) why the catcher of a supervised law took over last
+    cause: Array  #: (N,) reason of the last catch of a supervised law
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,14 +180,14 @@ class Piece:
 
     times: Array  #: (N,) [s]
     states: Array  #: (N, s)
-    held: Held | None = None  #: of sampled controllers, in the tick that ends at each instant
+    held: Held | None = None  #: outputs of a sampled controller in the tick that ends at each instant
 
 
 def run_compiled(function: ca.Function, *arguments: Any, **named: Any) -> Any:
-    """Call a function that integrates; Ctrl-C is deferred until it returns.
+    """Call a function that integrates; Ctrl-C takes effect after it returns.
 
     Raises:
-        SimulationError: if CVODES gives up.
+        SimulationError: if CVODES fails.
     """
     with deferred():
         try:
@@ -196,7 +197,7 @@ def run_compiled(function: ca.Function, *arguments: Any, **named: Any) -> Any:
 
 
 def list_cvodes_options(tolerance: float, stiff: bool) -> dict[str, Any]:
-    """Adams with functional iteration, which needs no Jacobian, or BDF with Newton's if Coulomb friction is stiff."""
+    """Adams with functional iteration, which needs no Jacobian; BDF with Newton iteration for stiff loops."""
     return {
         "linear_multistep_method": "bdf" if stiff else "adams",
         "nonlinear_solver_iteration": "newton" if stiff else "functional",
@@ -209,11 +210,11 @@ def list_cvodes_options(tolerance: float, stiff: bool) -> dict[str, Any]:
 
 
 class CompiledLoop:
-    """A closed loop in C. Building it compiles what is not yet in the cache.
+    """A closed loop in C. Its constructor compiles what is not cached.
 
     Args:
         loop: the loop.
-        reference: what it follows.
+        reference: the reference to follow.
 
     Raises:
         CompileError: if there is no C compiler.
@@ -229,7 +230,7 @@ class CompiledLoop:
         self._loop, self._gains = loop, list(loop.controller.gains.values())
 
     def continuous(self, step: float, tolerance: float, outputs: int) -> Callable[..., Array]:
-        """What `integrate` calls, for one thread; the first step has the given length [s]."""
+        """The function that `integrate` calls, for one thread; its first step has the given length [s]."""
         return partial(self._build_integrator(step, tolerance).continuous, outputs)
 
     def ticks(self, period: float, tolerance: float) -> Callable[..., tuple[Array, Array, Array]]:
@@ -237,12 +238,13 @@ class CompiledLoop:
         return partial(self._build_integrator(period, tolerance).ticks, period)
 
     def rows(self, name: str, *arguments: Array) -> list[Array]:
-        """`command`, `energy` or `measured` of the law for N rows of arguments; gains are added."""
+        """`command`, `energy` or `measured` of the law for N rows of arguments; gains are appended."""
         gains = [] if name == "measured" else self._gains
         return list(self._law.rows(name, *arguments, *gains))
 
     def _build_integrator(self, step: float, tolerance: float) -> Any:
-        from orthocas.codegen import compiled  # few runs need a code generator and a compiler
+        # Only compiled runs need a code generator and a compiler.
+        from orthocas.codegen import compiled
 
         loop, none = self._loop, [None] * 5
         kernels = (
@@ -273,7 +275,8 @@ def _compile_profile(profile: ca.Function) -> Any:
 
 
 def _compile(functions: Sequence[ca.Function]) -> Any:
-    from orthocas.codegen.compiled import CompiledFunctions  # few runs need a code generator and a compiler
+    # Only compiled runs need a code generator and a compiler.
+    from orthocas.codegen.compiled import CompiledFunctions
 
     return CompiledFunctions(functions)
 
@@ -291,10 +294,10 @@ def integrate(
     tolerance: float,
     compiled: CompiledLoop | None,
 ) -> Iterator[Piece]:
-    """Yield pieces of 25 instants, from just after the start to the end of the reference.
+    """Yield pieces of 25 instants, from the first one after the start to the end of the reference.
 
     Raises:
-        SimulationError: if the integrator gives up.
+        SimulationError: if the integrator fails.
     """
     run: Integrator = (
         _build_continuous(loop, reference, tolerance)
@@ -306,18 +309,18 @@ def integrate(
         for begin, end in _cut_pieces(reference, loop.loads.pushes, step * RULES.outputs):
             centre = np.array([(begin + end) / 2])
             segment, load = int(reference.segment(centre)[0]), loop.loads.at(centre)[0]
-            # Reference and loads do not change their formula within a piece.
+            # The formulas of reference and loads do not change within a piece.
             states = run((begin, end), reference.times[segment], reference.parameters[segment], load, state)
             state = states[-1]
             yield Piece(begin + (end - begin) * np.arange(1, RULES.outputs + 1) / RULES.outputs, states)
     finally:
-        # Its expressions share nodes with those that other threads build.
+        # Delete under the lock, because its expressions share nodes with those that other threads build.
         with building:
             del run
 
 
 def _build_continuous(loop: ClosedLoop, reference: Reference, tolerance: float) -> Integrator:
-    """What CVODES runs: an interval, with states at 25 equally spaced instants."""
+    """The CVODES integrator over an interval, with states at 25 equally spaced instants."""
     # CasADi may lose Ctrl-C while it builds functions.
     with deferred(), building:
         rate = loop.rate(reference)
@@ -326,7 +329,7 @@ def _build_continuous(loop: ClosedLoop, reference: Reference, tolerance: float) 
         x, s = kind.sym("x", state_size), kind.sym("s")
         p = kind.sym("p", 2 + p_size + load_size)
         length, since, parameters, load = p[0], p[1], p[2 : 2 + p_size], p[2 + p_size :]
-        # In s from 0 to 1, so that one integrator serves intervals of all lengths.
+        # Integrate over s from 0 to 1, so that one integrator serves intervals of all lengths.
         ode = length * rate(x, since + s * length, parameters, load)
         system, options = {"x": x, "t": s, "p": p, "ode": ode}, list_cvodes_options(tolerance, loop.stiff)
         grid = np.arange(1, RULES.outputs + 1) / RULES.outputs
@@ -340,8 +343,8 @@ def _build_continuous(loop: ClosedLoop, reference: Reference, tolerance: float) 
 
 
 def _cut_pieces(reference: Reference, pushes: tuple[Push, ...], longest: float) -> Iterator[tuple[float, float]]:
-    """Intervals of at most the given length, without a step of the reference or a change of load inside."""
-    # Steps of the reference, and starts and ends of pushes.
+    """Intervals of at most a given length, without a step of the reference or a change of load inside."""
+    # Cut at steps of the reference, and at starts and ends of pushes.
     edges = np.array([*reference.times, *(t for push in pushes for t in (push.start, push.end))])
     boundaries = np.unique(edges[edges <= reference.duration])
     boundaries = boundaries[np.diff(boundaries, prepend=-1.0) > RULES.same_time]
@@ -360,10 +363,10 @@ def run_ticks(
     tolerance: float,
     compiled: CompiledLoop | None,
 ) -> Iterator[Piece]:
-    """Yield pieces of 50 ticks, with the commands that were held.
+    """Yield pieces of 50 ticks, with the held commands.
 
     Raises:
-        SimulationError: if the integrator gives up.
+        SimulationError: if the integrator fails.
     """
     times, target, errors = sample_ticks(loop, reference, rate, noise)
     columns = (target, errors[:, : loop.size], loop.loads.mean(times, 1 / rate))
@@ -378,26 +381,26 @@ def run_ticks(
             state = states[-1]
             yield Piece(times[part] + period, states, Held(commands, status[:, 0], 0 * status[:, 0]))
     finally:
-        # Its expressions share nodes with those that other threads build.
+        # Delete under the lock, because its expressions share nodes with those that other threads build.
         with building:
             del run
 
 
 def sample_ticks(loop: ClosedLoop, reference: Reference, rate: float, noise: Noise) -> tuple[Array, Array, Array]:
-    """Starts of the ticks (N,) [s], references with derivatives (N, 3 k), errors of the sensors (N, 2 n)."""
-    # Whole ticks: the reference ends with its last segment.
+    """Starts of the ticks (N,) [s], references with derivatives (N, 3 k), and sensor errors (N, 2 n)."""
+    # Only whole ticks; the reference ends with its last segment.
     times = np.arange(int(np.floor(reference.duration * rate + 1e-9))) / rate
     return times, np.hstack(reference.sample(times)), noise.sample(len(times), loop.n)
 
 
 def yield_pieces(tick: Callable[[int], Array], times: Array, period: float, size: int) -> Iterator[Piece]:
-    """Yield pieces of 50 ticks for a plant that is driven tick by tick.
+    """Yield pieces of 50 ticks for a plant that is stepped tick by tick.
 
     Args:
-        tick: number of the tick -> [state at its end (size,); command (n,); status; cause].
+        tick: index of a tick -> [state at its end (size,); command (n,); status; cause].
         times: starts of the ticks (N,) [s].
-        period: their length [s].
-        size: of a state.
+        period: length of a tick [s].
+        size: size of the state.
     """
     for first in range(0, len(times), RULES.ticks):
         held = range(first, min(first + RULES.ticks, len(times)))
@@ -428,7 +431,7 @@ def _build_ticks(loop: ClosedLoop, period: float, k: int, tolerance: float) -> T
         ticks = tick.mapaccum(RULES.ticks)
 
     def run(state: Array, *columns: Array) -> tuple[Array, Array, Array]:
-        # The last row is repeated until there are as many rows as one call takes.
+        # Repeat the last row to fill the fixed number of rows of a call.
         missing = RULES.ticks - len(columns[0])
         inputs = [ca.DM(np.vstack([column, np.repeat(column[-1:], missing, axis=0)]).T) for column in columns]
         outputs = run_compiled(ticks, ca.DM(state), *inputs)
@@ -439,33 +442,36 @@ def _build_ticks(loop: ClosedLoop, period: float, k: int, tolerance: float) -> T
 
 
 class SupervisedLaw:
-    """A supervised law in compiled C, and the program around it.
+    """A supervised law in compiled C, and the program that resumes it.
 
     Args:
         controller: a law on a chart.
-        safety: its settings.
-        resume_after: time from each catch until the program asks for the law again [s]; infinite: never.
-        period: of the ticks [s].
+        safety: settings of the supervision.
+        resume_after: time from each catch until the program requests the law again [s]; infinite: never.
+        period: length of a tick [s].
 
     Raises:
-        InvalidValueError: for a law without a chart, for other settings, and periods that are always too late.
+        InvalidValueError: for a law without a chart, for invalid settings, and for a period that is too long.
         CompileError: if there is no C compiler.
     """
 
     def __init__(self, controller: Controller, safety: Safety, resume_after: float, period: float) -> None:
-        from orthocas import codegen  # few runs need a code generator and a compiler
+        # Only supervised runs need a code generator and a compiler.
+        from orthocas import codegen
 
         require_kind("safety", safety, Safety)
         if not as_number("resume_after", resume_after) >= 0:
             raise InvalidValueError("resume_after", resume_after, "a number >= 0 or infinity")
         if period > safety.longest_period:
             slowest = 1 / safety.longest_period
-            raise InvalidValueError("control_rate", 1 / period, f"at least {slowest:g}, as safety.longest_period wants")
+            raise InvalidValueError(
+                "control_rate", 1 / period, f"at least {slowest:g}, because of safety.longest_period"
+            )
         if controller.chart is None:
-            raise InvalidValueError("safety", "given", f"none with {controller.name} without a chart")
+            raise InvalidValueError("safety", "given", f"no safety, because {controller.name} has no chart")
         self._resume_after, self._period, self._caught_for = resume_after, period, 0.0
         self._joints, self._torque = controller.problem.robot.joint_names, controller.command == "torque"
-        # The law in C, which stays loaded when its folder is gone.
+        # The compiled law stays loaded after its folder is deleted.
         with open_draft_folder() as folder:
             generated = codegen.generate_c(controller.chart, folder / "law", controller, "law", safety=safety)
             library = codegen.compile_shared(generated, generated.folder)
@@ -473,7 +479,7 @@ class SupervisedLaw:
             self._law: Supervisor = codegen.Supervisor(compiled, controller)
 
     def start(self, q: Array, holding: Array) -> None:
-        """Begin at joint positions (n,), also where the torque (n,) that holds the plant is one that robots refuse."""
+        """Start at joint positions (n,); the holding torque (n,) may be one that a robot would refuse."""
         mismatch, status = self._law.check_start(q, holding)
         if self._torque and status is ControlStatus.LOAD_MISMATCH:
             worst = int(np.argmax(np.abs(mismatch)))
@@ -483,8 +489,8 @@ class SupervisedLaw:
         self._caught_for = 0.0
 
     def tick(self, q: Array, dq: Array, reference: Array) -> Array:
-        """[command; status; why the catcher took over last], (n + 2,), for a reference with two derivatives (3 k,)."""
-        # Mode 1 of the state in C is the catcher.
+        """[command; status; reason of the last catch], (n + 2,), for a reference with two derivatives (3 k,)."""
+        # Mode 1 of the C state is the catcher.
         self._caught_for = self._caught_for + self._period if self._law.mode == 1 else 0.0
         if self._caught_for > self._resume_after:
             self._law.resume()
@@ -493,18 +499,18 @@ class SupervisedLaw:
 
 
 class LawWithMemory:
-    """A law and its memory in Python.
+    """A law with memory, run in Python.
 
     Args:
         controller: a law with a memory.
-        period: of the ticks [s].
+        period: length of a tick [s].
     """
 
     def __init__(self, controller: Controller, period: float) -> None:
         self._ticks, self._period = Remembering(controller), period
 
     def start(self, q: Array, holding: Array) -> None:
-        """Begin, at any joint positions, whatever holds the plant."""
+        """Start at joint positions (n,) with any holding torque."""
         self._ticks.start()
 
     def tick(self, q: Array, dq: Array, reference: Array) -> Array:
@@ -525,7 +531,7 @@ def run_supervised(
     """Yield pieces of 50 ticks, with the commands that were held while CVODES integrated the plant.
 
     Raises:
-        SimulationError: if CVODES gives up.
+        SimulationError: if CVODES fails.
     """
     n, size = loop.n, len(start)
     times, target, errors = sample_ticks(loop, reference, rate, noise)
@@ -533,13 +539,13 @@ def run_supervised(
     # CasADi may lose Ctrl-C while it builds functions.
     with deferred(), building:
         plant = build_held_plant(loop, 1 / rate, tolerance)
-    # Each tick: measure, ask the law, hold its command while the plant moves.
+    # In each tick: measure, compute the command, and hold it while the plant moves.
     law.start(start[:n] + errors[0, :n], np.asarray(loop.plant.gravity(start[:n])))
     state, sent = start, np.zeros(n + 2)
 
     def tick(k: int) -> Array:
         nonlocal state, sent
-        # A velocity controller's robot follows its command.
+        # The robot of a velocity controller moves with the commanded velocity.
         dq = state[n:] if loop.torque else sent[:n]
         sent = law.tick(state[:n] + errors[k, :n], dq + errors[k, n:], target[k])
         state = run_compiled(plant, x0=ca.DM(state), p=ca.DM(np.concatenate([sent[:n], loads[k]])))["xf"].full().ravel()
@@ -557,10 +563,10 @@ def run_physics(
     scene: MuJoCo,
     supervised: SupervisedLaw | LawWithMemory | None,
 ) -> Iterator[Piece]:
-    """Yield pieces of 50 ticks, with the commands that were held: those of the law, or of the supervised law.
+    """Yield pieces of 50 ticks with the held commands of the law, or of the supervised law, on MuJoCo.
 
     Raises:
-        SimulationError: if MuJoCo gives up.
+        SimulationError: if MuJoCo fails.
     """
     plant = MuJoCoPlant(
         loop.plant,
@@ -572,11 +578,11 @@ def run_physics(
         timestep=scene.timestep,
         elasticity=scene.elasticity,
     )
-    # What holds the plant at rest, and the start.
+    # Reset the plant, and compute the torque that holds it at rest.
     plant.reset(start[: loop.n])
     holding = plant.bias
     plant.reset(start[: loop.n], start[loop.n :])
-    # What each tick needs: targets with derivatives, errors of the sensors, and the share of it that each push lasts.
+    # Inputs of each tick: targets with derivatives, sensor errors, and the fraction that each push covers.
     times, target, errors = sample_ticks(loop, reference, rate, noise)
     shares = loop.loads.shares(times, 1 / rate)
     # CasADi may lose Ctrl-C while it builds functions.
@@ -595,8 +601,8 @@ def run_physics(
 
 
 def apply_pushes(plant: MuJoCoPlant, loads: Loads, shares: Array) -> Array | None:
-    """Apply the forces of the pushes for a tick of which they last a share each. Returns their joint torques (n,)."""
-    # Pushes act by their shares of the tick; joint torques come beside the law's.
+    """Apply the forces of pushes for one tick, scaled by their fractions of it. Returns joint torques (n,)."""
+    # Joint torques of pushes are added to the law's.
     plant.release()
     if not shares.any():
         return None
@@ -609,7 +615,7 @@ def apply_pushes(plant: MuJoCoPlant, loads: Loads, shares: Array) -> Array | Non
 
 
 def _build_law(loop: ClosedLoop, k: int) -> Callable[[Array, Array, Array], Array]:
-    """q and dq as measured, reference with derivatives (3 k,) -> [command; status; no cause]."""
+    """Measured q and dq, reference with derivatives (3 k,) -> [command; status; no cause]."""
     state, reference = ca.MX.sym("state", 2 * loop.n), ca.MX.sym("reference", 3 * k)
     sent = ca.vertcat(*loop.commanded(state, (reference[:k], reference[k : 2 * k], reference[2 * k :])), 0)
     law = ca.Function("law", [state, reference], [sent])

@@ -1,4 +1,4 @@
-"""MuJoCo as the plant of a simulation: scenes, and steps."""
+"""MuJoCo as the plant of a simulation: scenes, models and time steps."""
 
 from __future__ import annotations
 
@@ -36,19 +36,19 @@ HAND = "hand"  #: name of the geom at the tip that touches the wall
 
 @dataclass(frozen=True, slots=True)
 class MuJoCoRules:
-    """Numbers of MuJoCo as plant."""
+    """Numbers of MuJoCo as a plant."""
 
     timestep: float = 1e-3  #: longest step of the physics [s]
-    timesteps: tuple[float, float] = (1e-6, 1e-2)  #: shortest and longest of these [s]
-    stop_time: float = 0.004  #: time constant of the stops, critically damped; MuJoCo's is 0.02 [s]
-    #: MuJoCo's 0.9 to 0.95 lets a motor press a light wrist 0.1 rad beyond its stop.
+    timesteps: tuple[float, float] = (1e-6, 1e-2)  #: allowed range of this step [s]
+    stop_time: float = 0.004  #: time constant of the stops, critically damped; MuJoCo's default is 0.02 [s]
+    #: MuJoCo's default of 0.9 to 0.95 lets a motor press a light wrist 0.1 rad beyond its stop
     stop_impedance: tuple[float, float] = (0.99, 0.999)
-    #: With MuJoCo's, a light wrist creeps at 0.4 rad/s below its friction.
+    #: with MuJoCo's default, a light wrist creeps at 0.4 rad/s below its friction
     friction_impedance: tuple[float, float] = (0.999, 0.999)
-    far: float = 1e9  #: MuJoCo's ranges have two ends [rad] or [m]
-    most_parts: int = 8  #: of the longest step, for RK4
-    largest: float = 1e10  #: torque [N m] or [N]
-    runaway: float = 1e6  #: velocity [rad/s] or [m/s]
+    far: float = 1e9  #: stands for an infinite limit, because MuJoCo's ranges have two finite ends [rad] or [m]
+    most_parts: int = 8  #: largest number of parts of the longest step with RK4
+    largest: float = 1e10  #: largest torque [N m] or [N]
+    runaway: float = 1e6  #: largest velocity [rad/s] or [m/s]
 
 
 RULES = MuJoCoRules()
@@ -82,15 +82,15 @@ class Payload:
 
 @dataclass(frozen=True, eq=False)
 class Wall:
-    """A fixed wall that a sphere around the tip can touch; the rest of the robot passes through it.
+    """A fixed wall that only a sphere around the tip can touch.
 
     Args:
-        point: middle of its face, in the world, (3,) [m].
-        normal: direction in which its face looks, (3,), of any length > 0.
+        point: centre of its face, in the world, (3,) [m].
+        normal: outward normal of the face, (3,), of any length > 0.
         tip_radius: radius of the sphere [m], > 0.
         size: length of the square face's sides [m], > 0.
-        thickness: of the wall behind the face [m], > 0.
-        time_constant: of the contact [s], > 0; contacts are critically damped. MuJoCo uses at least two time steps.
+        thickness: thickness of the wall behind the face [m], > 0.
+        time_constant: time constant of the contact [s], > 0, critically damped. MuJoCo uses at least two time steps.
     """
 
     point: Array
@@ -112,15 +112,15 @@ class Wall:
 
 @dataclass(frozen=True, eq=False)
 class Elasticity:
-    """Springs and dampers between the rotors of the motors and the joints, as of gears that give way.
+    """Springs and dampers between motor rotors and joints, as in elastic gears.
 
     With rotors at theta, M ddq + C dq + g = k (theta - q) + d (dtheta - dq) + loads and
     B ddtheta = u - friction - k (theta - q) - d (dtheta - dq). Rotors turn about their own axes only [S1987].
 
     Args:
         stiffness: k > 0, (n,) or one number [N m/rad].
-        inertia: B > 0 of the rotors, seen at the joints, which takes the place of the robot's armatures, (n,) or one
-            number [kg m^2].
+        inertia: B > 0 of the rotors, seen at the joints, (n,) or one number [kg m^2]. It replaces the robot's
+            armatures.
         damping: d >= 0, (n,) or one number [N m s/rad].
     """
 
@@ -132,7 +132,7 @@ class Elasticity:
         """Stiffness, inertia and damping of n joints, (n,) each.
 
         Raises:
-            ShapeError, InvalidValueError: for other shapes and values.
+            ShapeError, InvalidValueError: for invalid shapes and values.
         """
         gains = [positive_gains(f"{name} of elasticity", getattr(self, name), n) for name in ("stiffness", "inertia")]
         return gains[0], gains[1], non_negative_gains("damping of elasticity", self.damping, n)
@@ -140,19 +140,19 @@ class Elasticity:
 
 @dataclass(frozen=True, eq=False)
 class MuJoCo:
-    """MuJoCo as plant of `simulate`: `simulate(..., plant=MuJoCo(...), control_rate=1000)`.
+    """MuJoCo as a plant of `simulate`: `simulate(..., plant=MuJoCo(...), control_rate=1000)`.
 
-    The model is made from the robot's own numbers, so every chart file has one; see `MuJoCoPlant`. Needs the extra
+    The model is built from the robot's numbers, so it works for every chart file; see `MuJoCoPlant`. Needs the extra
     `orthocas[mujoco]`.
 
     Args:
-        robot: the true robot; default the controller's model.
-        stops: whether the joints stop at their limits of position.
-        effort_limits: whether the motors saturate at the robot's limits of effort.
-        payload: a body fixed at the tip, which the controller does not know.
-        wall: a wall in the tip's way.
+        robot: the true robot; default: the controller's model.
+        stops: whether joints stop at their position limits.
+        effort_limits: whether motors saturate at the robot's effort limits.
+        payload: a body fixed at the tip, unknown to the controller.
+        wall: a wall that the tip may touch.
         timestep: longest step of the physics [s], from 1e-6 to 0.01.
-        elasticity: of the gears; default rigid ones. Sensors then measure joints, not rotors.
+        elasticity: elasticity of the gears; default: rigid. Sensors measure the joints, not the rotors.
     """
 
     robot: Robot | None = None
@@ -175,7 +175,7 @@ class MuJoCo:
 
 
 def mujoco() -> ModuleType:
-    """The package `mujoco`, which only simulations with MuJoCo need.
+    """Import the package `mujoco`, which only simulations with MuJoCo need.
 
     Raises:
         MissingExtraError: if it is not installed.
@@ -189,25 +189,26 @@ def body_name(i: int) -> str:
 
 
 def rotor_name(joint: str) -> str:
-    """Name of the joint of a rotor, from that of the robot's joint, with elasticity."""
+    """Name of the rotor's joint for a joint of the robot, if gears are elastic."""
     return f"{joint}/rotor"
 
 
 def handle_name(i: int) -> str:
-    """Name of the massless body where pushes at body i act."""
+    """Name of the massless body on which pushes at body i act."""
     return f"handle{i}"
 
 
 def mujoco_model(tree: KinematicTree, scene: MuJoCo, viscous: Array, coulomb: Array) -> Any:
     """An `mjModel` with the dynamics of a tree: M ddq + C dq + g = u - friction + loads.
 
-    Joints have the robot's names. The motor "motor<i>" (gear 1) moves joint i, which carries "body<i>" and the massless
-    "handle<i>", where pushes act. The tip frame is the body "tip". With elasticity, the motor turns the joint
-    "<name>/rotor", which the spring "gear<i>" couples to the joint; friction then acts at the rotor.
+    Joints have the robot's names. The motor "motor<i>" (gear 1) moves joint i. This joint carries "body<i>" and the
+    massless "handle<i>", on which pushes act. The tip frame is the body "tip". With elasticity, the motor moves the
+    joint "<name>/rotor" instead, which the spring "gear<i>" couples to the robot's joint; friction then acts at the
+    rotor.
 
     Args:
         tree: the robot.
-        scene: what else there is: stops, limits of effort, a payload, a wall.
+        scene: stops, effort limits, payload, wall and elasticity.
         viscous: joint damping (n,) [N m s/rad] or [N s/m].
         coulomb: dry friction (n,) [N m] or [N], a constraint that MuJoCo solves (`frictionloss`).
 
@@ -220,9 +221,9 @@ def mujoco_model(tree: KinematicTree, scene: MuJoCo, viscous: Array, coulomb: Ar
     spec = mj.MjSpec()
     spec.compiler.degree = False
     spec.option.gravity = tree.gravity
-    # A run that diverges must say so.
+    # Report a run that diverges instead of resetting it.
     spec.option.disableflags |= mj.mjtDisableBit.mjDSBL_AUTORESET
-    # One body for each joint, with a massless handle where pushes act, and a motor.
+    # One body per joint, with a massless handle for pushes, and a motor.
     bodies: list[Any] = []
     for i, parent in enumerate(tree.parents):
         carrier = bodies[parent] if parent >= 0 else spec.worldbody
@@ -250,24 +251,24 @@ def mujoco_model(tree: KinematicTree, scene: MuJoCo, viscous: Array, coulomb: Ar
 
 
 def _add_body(mj: ModuleType, carrier: Any, name: str, position: Array, rotation: Array) -> Any:
-    """A body whose inertia is `_set_inertias`'s to write."""
+    """Add a body whose inertia `_set_inertias` will write."""
     body = carrier.add_body(name=name, pos=position, quat=_compute_quaternion(mj, rotation))
     _place_inertia(body, 1.0)
     return body
 
 
 def _place_inertia(body: Any, scale: float) -> None:
-    """A placeholder: MuJoCo would refuse identified inertias, and take short cuts with a centre at the origin."""
+    """Set a placeholder, because MuJoCo refuses identified inertias and treats centres at 0 specially."""
     body.explicitinertial = True
     body.mass, body.inertia = scale, scale * np.array([1.0, 1.1, 1.2])
     body.ipos, body.iquat = (0.1, 0.2, 0.3), (0.5, 0.5, -0.5, 0.5)
 
 
 def _add_joint(mj: ModuleType, body: Any, tree: KinematicTree, i: int, stops: bool) -> Any:
-    # Turns or slides, with the inertia of its own rotor.
+    # A hinge or a slide, with the inertia of the robot's own rotor.
     kind = mj.mjtJoint.mjJNT_SLIDE if tree.joint_kinds[i] == "prismatic" else mj.mjtJoint.mjJNT_HINGE
     joint = body.add_joint(name=tree.joint_names[i], type=kind, axis=(0, 0, 1), armature=tree.armatures[i])
-    # Stops at limits, if the scene has them.
+    # Stops at finite limits, if the scene has stops.
     ends = np.array([tree.lower[i], tree.upper[i]])
     limited = stops and bool(np.isfinite(ends).any())
     joint.limited = mj.mjtLimited.mjLIMITED_TRUE if limited else mj.mjtLimited.mjLIMITED_FALSE
@@ -278,16 +279,16 @@ def _add_joint(mj: ModuleType, body: Any, tree: KinematicTree, i: int, stops: bo
 
 
 def _add_rotor(mj: ModuleType, spec: Any, joint: Any, i: int, numbers: tuple[Array, Array, Array]) -> Any:
-    """A joint of its own in the world, with the inertia of a rotor, and a spring between it and the robot's joint."""
+    """Add a rotor as a joint in the world, and a spring between it and the robot's joint."""
     stiffness, inertia, damping = (float(part[i]) for part in numbers)
-    # A body that gravity does not pull, with the inertia of the rotor.
+    # A body without weight, with the inertia of the rotor.
     body = spec.worldbody.add_body(name=f"rotor_body{i}", gravcomp=1.0)
     body.explicitinertial = True
     body.mass, body.inertia = inertia, (inertia, inertia, inertia)
     rotor = body.add_joint(name=rotor_name(joint.name), type=joint.type, axis=(0, 0, 1))
     rotor.limited = mj.mjtLimited.mjLIMITED_FALSE
     joint.armature = 0.0
-    # The spring keeps the two angles equal.
+    # The spring acts on the difference of the two angles.
     gear = spec.add_tendon(name=f"gear{i}", springlength=(0.0, 0.0))
     gear.stiffness[0], gear.damping[0] = stiffness, damping
     gear.wrap_joint(rotor.name, 1.0)
@@ -296,7 +297,7 @@ def _add_rotor(mj: ModuleType, spec: Any, joint: Any, i: int, numbers: tuple[Arr
 
 
 def _add_wall(mj: ModuleType, spec: Any, tip: Any, wall: Wall) -> None:
-    """A sphere at the tip and a fixed box; nothing else touches anything."""
+    """Add a sphere at the tip and a fixed box; no other geoms collide."""
     half = np.array([wall.size / 2, wall.size / 2, wall.thickness / 2])
     centre = wall.point - wall.normal * half[2]
     solref = (wall.time_constant, 1.0)
@@ -307,13 +308,13 @@ def _add_wall(mj: ModuleType, spec: Any, tip: Any, wall: Wall) -> None:
 
 
 def _set_inertias(mj: ModuleType, model: Any, tree: KinematicTree, payload: Payload | None) -> None:
-    """Write masses, centres and principal moments of inertia, and what MuJoCo derives from them."""
+    """Write masses, centres and principal moments of inertia, and values that MuJoCo derives from them."""
     bodies = {body_name(i): (tree.masses[i], tree.centres[i], tree.inertias[i]) for i in range(tree.n)}
     nothing = (0.0, np.zeros(3), np.zeros((3, 3)))
     bodies[TIP] = nothing if payload is None else (payload.mass, payload.centre, payload.inertia)
     for name, (mass, centre, inertia) in bodies.items():
         moments, axes = np.linalg.eigh((inertia + inertia.T) / 2)
-        # +-1: a rotation.
+        # Make the axes a rotation, with determinant +1.
         axes[:, 2] *= np.linalg.det(axes)
         k = model.body(name).id
         model.body_mass[k], model.body_ipos[k], model.body_inertia[k] = mass, centre, moments
@@ -328,22 +329,22 @@ def _compute_quaternion(mj: ModuleType, rotation: Array) -> Array:
 
 
 class MuJoCoPlant(Shown):
-    """A robot in MuJoCo that holds a torque for a tick, then shows where it is. Fast enough for runs of many ticks.
+    """A robot in MuJoCo that holds a torque for a tick and then reports its state; fast enough for long runs.
 
-    M ddq + C dq + g = clip(torque) + loads + pushes - friction, with stops at the joint limits. The physics takes steps
-    of fourth order (RK4), shorter ones where viscous friction is stiff for the inertia of a joint
-    (docs/reference/simulation.md). Not for several threads at once. Needs the extra `orthocas[mujoco]`.
+    M ddq + C dq + g = clip(torque) + loads + pushes - friction, with stops at the joint limits. The physics takes
+    fourth-order steps (RK4). They are shorter where viscous friction is stiff for the inertia of a joint
+    (docs/reference/simulation.md). Not thread-safe. Needs the extra `orthocas[mujoco]`.
 
     Args:
         robot: the true robot.
         friction: viscous friction becomes MuJoCo's joint damping, Coulomb friction its `frictionloss`.
-        stops: whether the joints stop at their limits of position.
-        effort_limits: whether the motors saturate at the robot's limits of effort.
+        stops: whether joints stop at their position limits.
+        effort_limits: whether motors saturate at the robot's effort limits.
         payload: a body fixed at the tip.
-        wall: a wall in the tip's way.
+        wall: a wall that the tip may touch.
         timestep: longest step of the physics [s], from 1e-6 to 0.01.
-        elasticity: of the gears; default rigid ones. Motors and friction then act on rotors, which springs couple to
-            the joints.
+        elasticity: elasticity of the gears; default: rigid. Motors and friction then act on rotors, which springs
+            couple to the joints.
 
     Raises:
         ShapeError, InvalidValueError: for arguments of the wrong shape, value or type.
@@ -381,15 +382,17 @@ class MuJoCoPlant(Shown):
         require_kind("friction", friction, Friction)
         viscous, coulomb, extra, _ = np.split(friction.numbers(robot.n), 4)
         if extra.any():
-            raise InvalidValueError("breakaway", friction.breakaway, "none in MuJoCo; StickingPlant has it")
+            raise InvalidValueError(
+                "breakaway", friction.breakaway, "no breakaway friction, which only StickingPlant has"
+            )
         self.robot, self.elasticity = robot, elasticity
-        #: MuJoCo's model and data, for renderers and for looking; `step` owns them.
+        #: MuJoCo's model and data, for renderers and for inspection; only `step` may change them
         self.model: Any = mujoco_model(robot.tree, scene, viscous, coulomb)
         self.data: Any = mujoco().MjData(self.model)
         self._step = mujoco().mj_step
         self._timestep = float(timestep)
         self._dofs = self._find_dofs(robot.joint_names)
-        #: joints that the motors move: those of the robot, or their rotors
+        #: indices of the velocities that motors drive: of the robot's joints, or of their rotors
         self._motors = self._dofs if elasticity is None else self._find_dofs(map(rotor_name, robot.joint_names))
         self._handles = [int(self.model.body(handle_name(i)).id) for i in range(robot.n)]
         self.reset(np.zeros(robot.n))
@@ -411,7 +414,7 @@ class MuJoCoPlant(Shown):
 
     @property
     def motor_q(self) -> Array:
-        """Positions of the rotors, as encoders of motors measure them, (n,); with rigid gears those of the joints."""
+        """Positions of the rotors, as motor encoders measure them, (n,); equal to q with rigid gears."""
         return np.asarray(self.data.qpos[self._motors])
 
     @property
@@ -426,18 +429,18 @@ class MuJoCoPlant(Shown):
 
     @property
     def torque(self) -> Array:
-        """The torque of the motors in the last step, after saturation (n,) [N m] or [N]."""
+        """Motor torque in the last step, after saturation (n,) [N m] or [N]."""
         return np.asarray(self.data.qfrc_actuator[self._motors])
 
     @property
     def acceleration(self) -> Array:
-        """Joint accelerations now, with the torque and the loads of the last step, (n,) [rad/s^2] or [m/s^2]."""
+        """Joint accelerations under the torque and the loads of the last step, (n,) [rad/s^2] or [m/s^2]."""
         mujoco().mj_forward(self.model, self.data)
         return np.asarray(self.data.qacc[self._dofs])
 
     @property
     def bias(self) -> Array:
-        """C dq + g with the payload, (n,) [N m] or [N], a copy: at rest, the torque that holds the arm."""
+        """C dq + g with the payload, (n,) [N m] or [N], a copy. At rest, this torque holds the arm."""
         return np.array(self.data.qfrc_bias[self._dofs])
 
     @property
@@ -447,24 +450,24 @@ class MuJoCoPlant(Shown):
         for k in range(self.data.ncon):
             mujoco().mj_contactForce(self.model, self.data, k, wrench)
             contact = self.data.contact[k]
-            # The force acts on the second geom.
+            # MuJoCo's contact force acts on the second geom.
             sign = 1.0 if contact.geom[1] == self.model.geom(HAND).id else -1.0
             total += sign * np.reshape(contact.frame, (3, 3)).T @ wrench[:3]
         return total
 
     def reset(self, q: ArrayLike, dq: ArrayLike | None = None) -> None:
-        """Begin anew at joint positions (n,) and velocities (n,), default at rest, at time 0 and without pushes.
+        """Restart at joint positions (n,) and velocities (n,) (default: at rest), at time 0 and without pushes.
 
-        Rotors of elastic gears start where their springs carry the robot's own weight.
+        Rotors of elastic gears start where their springs hold the robot's own weight.
 
         Raises:
-            ShapeError, InvalidValueError: for other states.
+            ShapeError, InvalidValueError: for invalid states.
         """
         q = as_point("q", q, self.robot.n)
         dq = np.zeros(self.robot.n) if dq is None else as_point("dq", dq, self.robot.n)
         mujoco().mj_resetData(self.model, self.data)
         for warning in self.data.warning:
-            # MuJoCo prints and logs the first one: `step` raises an error instead.
+            # MuJoCo prints and logs only the first warning, so set the count to 1; `step` raises an error instead.
             warning.number = 1
         if self.elasticity is not None:
             sag = np.asarray(self.robot.gravity(q), dtype=float) / self.elasticity.numbers(self.robot.n)[0]
@@ -474,11 +477,11 @@ class MuJoCoPlant(Shown):
         self._choose_integrator()
 
     def _choose_integrator(self) -> None:
-        """Choose steps of at most 1 / rate, where rate is the largest eigenvalue of M^-1 D at the start.
+        """Choose physics steps of at most 1 / rate, where rate is the largest eigenvalue of M^-1 D at the start.
 
-        RK4 is stable up to 2.8 / rate. If 1 / rate is less than an eighth of the longest step, an implicit method of
-        first order takes eighths. Springs K need steps of at most 1 / frequency with both, the root of the largest
-        eigenvalue of M^-1 K.
+        RK4 is stable up to 2.8 / rate. If 1 / rate is less than an eighth of the longest step, a first-order implicit
+        method takes steps of an eighth. With both methods, springs K require steps of at most 1 / frequency, where
+        frequency^2 is the largest eigenvalue of M^-1 K.
         """
         # D and K of all joints and rotors, and the largest eigenvalues of M^-1 D and M^-1 K.
         M, D = np.zeros((self.model.nv,) * 2), np.diag(self.model.dof_damping)
@@ -493,7 +496,7 @@ class MuJoCoPlant(Shown):
             self._timestep * float(np.linalg.eigvals(np.linalg.solve(M, part)).real.max()) if part.any() else 0.0
             for part in (D, K)
         )
-        # Steps of a length at which the method is stable.
+        # Number of parts of the longest step for which the method is stable.
         parts = max(
             min(ceil(min(damped, RULES.most_parts + 1)), RULES.most_parts), ceil(sqrt(self._timestep * squared)), 1
         )
@@ -502,7 +505,7 @@ class MuJoCoPlant(Shown):
         self._longest = self._timestep / parts
 
     def _find_dofs(self, names: Iterable[str]) -> NDArray[np.intp]:
-        """Where joints stand among all."""
+        """Indices of joints among all velocities of the model."""
         return np.array([self.model.joint(name).dofadr[0] for name in names])
 
     def push(self, force: ArrayLike, link: Link = None, point: ArrayLike = (0.0, 0.0, 0.0)) -> None:
@@ -510,25 +513,25 @@ class MuJoCoPlant(Shown):
 
         Args:
             force: in world axes, (3,) [N].
-            link: the link, by the name or the index of the joint that moves it; default the tip.
-            point: where the force acts, in the frame of the link, or of the tip, (3,) [m]. Frames of links are those of
-                `robot.tree`: the origin is on the joint's axis, which is z.
+            link: the link, by the name or the index of the joint that moves it; default: the tip.
+            point: point where the force acts, in the frame of the link, or of the tip, (3,) [m]. Frames of links are
+                those of `robot.tree`: the origin lies on the joint's axis, which is z.
 
         Raises:
-            ShapeError, InvalidValueError, UnknownNameError: for other forces and places.
+            ShapeError, InvalidValueError, UnknownNameError: for invalid forces, points or links.
         """
         force = freeze_array("force", force, (3,))
         body, at = place_of(self.robot.tree, link, freeze_array("point", point, (3,)))
         if body < 0:
-            # What carries the tip does not move.
+            # The tip is fixed to the world, so a push has no effect.
             return
         handle = self._handles[body]
         applied = self.data.xfrc_applied[handle]
         if not applied.any():
-            # The handle has no mass: its centre may be anywhere.
+            # The handle has no mass, so its centre can be placed at the point of the force.
             self.model.body_ipos[handle] = at
         else:
-            # Another push at this link: the same force, and the torque between the two points.
+            # A further push at this link adds its force, and its torque about the first point.
             mujoco().mj_kinematics(self.model, self.data)
             rotation = np.reshape(self.data.xmat[handle], (3, 3))
             applied[3:] += np.cross(rotation @ (at - self.model.body_ipos[handle]), force)
@@ -542,12 +545,12 @@ class MuJoCoPlant(Shown):
         """Hold a torque for some time.
 
         Args:
-            torque: of the motors, (n,) [N m] or [N].
-            seconds: > 0 [s]; divided into equal steps of the physics, none longer than `timestep`.
-            loads: further joint torques, which do not saturate, (n,) [N m] or [N].
+            torque: motor torque, (n,) [N m] or [N].
+            seconds: > 0 [s]; divided into equal physics steps, none longer than `timestep`.
+            loads: additional joint torques, which do not saturate, (n,) [N m] or [N].
 
         Raises:
-            ShapeError, InvalidValueError: for torques that are not (n,) or not finite, and ticks that are too long.
+            ShapeError, InvalidValueError: for torques that are not (n,) or not finite, and for ticks that are too long.
             SimulationError: if the state has diverged.
         """
         data = self.data
@@ -557,10 +560,12 @@ class MuJoCoPlant(Shown):
         self.model.opt.timestep = seconds / steps
         self._step(self.model, data, steps)
         if not data.qvel @ data.qvel < RULES.runaway**2:
-            raise SimulationError(f"MuJoCo gave up at {self.time:g} s: joint velocities beyond {RULES.runaway:g}")
+            raise SimulationError(
+                f"the simulation diverged at {self.time:g} s: joint velocities beyond {RULES.runaway:g}"
+            )
 
     def _check(self, name: str, value: ArrayLike) -> Array:
-        """Joint torques (n,). MuJoCo would take 0 in place of NaN and of larger ones."""
+        """Check joint torques (n,). MuJoCo would replace NaN and very large torques by 0."""
         if type(value) is not np.ndarray or value.shape != (self.robot.n,) or value.dtype != float:
             value = as_point(name, value, self.robot.n)
         if not np.abs(value).max() < RULES.largest:

@@ -1,4 +1,4 @@
-"""`simulate` and `simulate_many`: a controller, a reference and a robot in closed loop."""
+"""`simulate` and `simulate_many`: run a controller, a reference and a robot in closed loop."""
 
 from __future__ import annotations
 
@@ -63,44 +63,46 @@ def simulate(
     """Simulate a closed loop for the duration of the reference, with SUNDIALS (CVODES), in compiled C or with MuJoCo.
 
     With a torque controller, the robot obeys M ddq + C dq + g = tau + loads - friction ([AS2023] eq. (26)). With a
-    velocity controller it follows its commands perfectly, dq = command. In MuJoCo, joints also stop at their limits,
-    motors saturate at the robot's limits of effort, and the tip may touch a wall.
+    velocity controller it follows its command exactly, dq = command. In MuJoCo, joints also stop at their limits,
+    motors saturate at the robot's effort limits, and the tip may touch a wall.
 
     Args:
-        controller: see `orthocas.control`.
-        reference: the motion to follow, with the labels of the controller.
+        controller: a controller of `orthocas.control`.
+        reference: the reference motion, with the labels of the controller.
         q_start: joint positions at t = 0, (n,) [rad] or [m].
-        dq_start: joint velocities at t = 0, (n,); default at rest. For torque controllers only.
+        dq_start: joint velocities at t = 0, (n,); default: at rest. For torque controllers only.
         step: longest time between two instants of the result [s].
-        control_rate: ticks per second of a sampled controller, which holds its command between ticks. The instants of
-            the result are then the ticks. Default: a controller in continuous time.
-        plant: the true robot, for example `robot.with_scaled_masses(1.1)`; default the controller's model. Or "mujoco",
-            or `MuJoCo(robot, ...)`: the robot in MuJoCo, for sampled torque controllers (extra `orthocas[mujoco]`).
-        pushes: external loads, at the tip, at links or at joints.
+        control_rate: ticks per second of a sampled controller, which holds its command between ticks. The result then
+            has one instant per tick. Default: a controller in continuous time.
+        plant: the true robot, for example `robot.with_scaled_masses(1.1)`; default: the controller's model. Or
+            "mujoco", or `MuJoCo(robot, ...)`: the robot in MuJoCo, for sampled torque controllers (extra
+            `orthocas[mujoco]`).
+        pushes: external loads at the tip, at links or at joints.
         friction: friction in the joints.
-        stops: joint stops for CVODES; default none. For torque controllers only. MuJoCo has its own.
+        stops: joint stops for CVODES; default: none. For torque controllers only. MuJoCo has its own stops.
         noise: noise on the measurements of a sampled controller.
         safety: run the supervised law of the generated C with these settings, for example
-            `oc.control.Safety.of(controller)`, in place of the law alone. Needs a law on a chart, a `control_rate` and
-            a C compiler. The run begins as on the robot, with NAME_start; its `status` and `cause` say what happened.
-        resume_after: with `safety`, time from a catch until the law is asked for again [s]; infinite: never.
-        must_be_reachable: whether to raise an error, before the run, if the reference leaves the domain.
+            `oc.control.Safety.of(controller)`, instead of the law alone. Needs a law on a chart, a `control_rate` and a
+            C compiler. As on the robot, the run begins with NAME_start; `status` and `cause` of the result tell what
+            happened.
+        resume_after: with `safety`, time from a catch until the law is requested again [s]; infinite: never.
+        must_be_reachable: whether to raise an error before the run if the reference leaves the domain.
         tolerance: relative and absolute tolerance of the integrator.
         compiled: run law, robot and integrator in C (Dormand and Prince's method of order 8), with the same results
-            within the tolerance. The first run with a law compiles it, which takes some seconds; libraries stay in
-            `orthocas/libraries` in $XDG_CACHE_HOME or ~/.cache. Needs a C compiler; not with `safety` or MuJoCo.
-        monitor: called with progress.
+            within the tolerance. The first run with a law compiles it, which takes some seconds. Libraries are cached
+            in `orthocas/libraries` in $XDG_CACHE_HOME or ~/.cache. Needs a C compiler; not with `safety` or MuJoCo.
+        monitor: receives progress.
 
     Returns:
-        The trajectory. Its outcome says whether it ended early because the integrator gave up, or whether the law lost
-        the arm: LOST with a `reason`, see `orthocas.simulation.trajectory.find_loss`.
+        The trajectory. Its outcome tells whether the run ended early because the integrator failed, or whether the law
+        lost the arm: LOST with a `reason`, see `orthocas.simulation.trajectory.find_loss`.
 
     Raises:
         UnreachableReferenceError: if the reference leaves the domain.
         MissingExtraError: if MuJoCo is the plant and not installed.
-        CompileError: if a supervised law needs a C compiler and there is none.
+        CompileError: if C must be compiled and there is no C compiler.
         ShapeError, InvalidValueError, UnknownNameError: for arguments of the wrong shape, value or type.
-        Interrupted: after Ctrl-C; its `result` is the trajectory up to there, with outcome INTERRUPTED.
+        Interrupted: after Ctrl-C; its `result` is the trajectory so far, with outcome INTERRUPTED.
 
     Example:
         >>> import orthocas as oc
@@ -152,7 +154,7 @@ class Settings:
 
 
 def prepare(controller: Controller, reference: Reference, q_start: ArrayLike, settings: Settings) -> Prepared:
-    """Check the arguments of `simulate`, and build what the run needs."""
+    """Check the arguments of `simulate`, and build the closed loop."""
     friction, noise, rate = settings.friction, settings.noise, settings.control_rate
     _check_kinds(controller, reference, settings)
     robot, scene = _read_plant(settings.plant, controller)
@@ -169,7 +171,7 @@ def prepare(controller: Controller, reference: Reference, q_start: ArrayLike, se
         controller.require_reachable(reference, start[: loop.n])
     compiled = CompiledLoop(loop, reference) if settings.compiled else None
 
-    # What runs the loop: in continuous time, or tick by tick in MuJoCo, in CVODES or in compiled C.
+    # Choose what runs the loop: in continuous time, or tick by tick in MuJoCo, in CVODES or in compiled C.
     run: Callable[..., Iterator[Piece]]
     if rate is None:
         run = partial(integrate, step=settings.step, tolerance=settings.tolerance, compiled=compiled)
@@ -205,7 +207,7 @@ def _read_plant(plant: Plant, controller: Controller) -> tuple[Robot, MuJoCo | N
     """The true robot, and the scene if MuJoCo simulates it.
 
     Raises:
-        InvalidValueError: if the plant is something else.
+        InvalidValueError: if the plant is of another type.
     """
     model = controller.problem.robot
     scene = MuJoCo() if isinstance(plant, str) and plant == MUJOCO else plant
@@ -218,7 +220,7 @@ def _read_plant(plant: Plant, controller: Controller) -> tuple[Robot, MuJoCo | N
 
 
 def _check_settings(loop: ClosedLoop, reference: Reference, settings: Settings, scene: MuJoCo | None) -> None:
-    """Raise InvalidValueError for arguments that would be ignored, or fail later with a less clear message."""
+    """Raise InvalidValueError for arguments that would be ignored, or would fail later with an unclear message."""
     rate, end, law = settings.control_rate, reference.duration, loop.controller
     for name, value in (("step", settings.step), ("tolerance", settings.tolerance), ("control_rate", rate)):
         if value is not None:
@@ -231,7 +233,7 @@ def _check_settings(loop: ClosedLoop, reference: Reference, settings: Settings, 
     ticks = (rate or 0.0) * end
     in_python = "MuJoCo" if in_mujoco else "safety"
     faults = (
-        # What does not fit together.
+        # Arguments that do not fit together.
         (
             reference.labels != law.labels,
             "labels of the reference",
@@ -248,7 +250,7 @@ def _check_settings(loop: ClosedLoop, reference: Reference, settings: Settings, 
         (last_push >= end, "start of a push", last_push, f"a time before the end at {end:g} s"),
         (sampled and ticks < 1, "control_rate", rate, f"at least one tick in {end:g} s"),
         (ticks > RULES.most_ticks, "control_rate", rate, f"at most {RULES.most_ticks:g} ticks in {end:g} s"),
-        # What needs ticks.
+        # Arguments that require ticks.
         (
             settings.noise is not None and not sampled,
             "noise",
@@ -263,7 +265,7 @@ def _check_settings(loop: ClosedLoop, reference: Reference, settings: Settings, 
         ),
         (in_mujoco and not sampled, "control_rate", None, "a number, because MuJoCo runs with a sampled controller"),
         (remembers and not sampled, "control_rate", None, "a rate, such as 1000.0, for a law with a memory"),
-        # What MuJoCo and compiled C do not go with.
+        # Arguments that MuJoCo or compiled C do not support.
         (
             in_mujoco and not loop.torque,
             "plant",
@@ -291,7 +293,7 @@ def _check_settings(loop: ClosedLoop, reference: Reference, settings: Settings, 
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """A closed loop that is ready to run, once."""
+    """A closed loop that can run once."""
 
     loop: ClosedLoop
     reference: Reference
@@ -301,12 +303,12 @@ class Prepared:
     supervised: bool
 
     def run(self, monitor: Monitor) -> Trajectory:
-        """Simulate.
+        """Run the simulation.
 
         Raises:
-            Interrupted: after Ctrl-C; its `result` is the trajectory up to there, with outcome INTERRUPTED.
+            Interrupted: after Ctrl-C; its `result` is the trajectory so far, with outcome INTERRUPTED.
         """
-        # A run that ends early is a result, too.
+        # A run that ends early is a result too.
         pieces: list[Piece] = []
         outcome = Outcome.COMPLETE
         try:
@@ -322,22 +324,22 @@ class Prepared:
         try:
             run = self._build_trajectory(pieces, outcome)
         except KeyboardInterrupt:
-            # Keep the run up to here.
+            # Keep the run so far.
             run = self._build_trajectory(pieces, Outcome.INTERRUPTED)
         if run.outcome is Outcome.INTERRUPTED:
             raise Interrupted(run)
         return run
 
     def _build_trajectory(self, pieces: Sequence[Piece], outcome: Outcome) -> Trajectory:
-        """Join the pieces, and add what follows from the states and the reference."""
+        """Join the pieces, and compute the quantities that follow from states and reference."""
         loop, controller, n = self.loop, self.loop.controller, self.loop.n
-        # The state at t = 0, then those at the ends of all steps.
+        # The state at t = 0, then the states at the ends of all steps.
         times = np.concatenate([[0.0], *(piece.times for piece in pieces)])
         states = np.vstack([self.start, *(piece.states for piece in pieces)])
         q = states[:, :n]
         target = self.reference.sample(np.minimum(times, self.reference.duration))
         dq = states[:, n:] if loop.torque else np.zeros_like(q)
-        # Commands that were held, the last one also for the end; or those of the law.
+        # Take the held commands, and repeat the last one at the end. In continuous time, evaluate the law.
         held = [piece.held for piece in pieces if piece.held is not None]
         if held:
             columns = ([part.commands for part in held], [part.status for part in held], [part.cause for part in held])
@@ -348,10 +350,9 @@ class Prepared:
         energy = controller.energy if self.compiled is None else controller.energy_graph
         unknown = [np.full((len(times), 1), np.nan)] * 2
         storage, power = unknown if energy is None else self._evaluate("energy", q, dq, *target)
-        # The controlled quantities.
         value, chart = self._evaluate("measured", q)[0], controller.chart
         if chart is not None and controller.labels == chart.labels and chart.parts.turns.any():
-            # Circle-valued quantities with the whole turns that bring them nearest to the reference.
+            # Shift circle-valued quantities by the full turns that bring them nearest to the reference.
             value = np.asarray(target[0] + wrap_shortest(value - target[0], chart.parts.turns))
         run = Trajectory(
             controller=controller.name,
@@ -372,13 +373,13 @@ class Prepared:
             dissipated_power=power[:, 0],
             cause=cause.astype(int),
         )
-        # A law may keep running and have lost its arm.
+        # A law may continue although it has lost the arm.
         reason = find_loss(run, controller, loop.loads.pushes, self.supervised) if outcome is Outcome.COMPLETE else ""
         return replace(run, outcome=Outcome.LOST, reason=reason) if reason else run
 
     def _evaluate(self, name: str, *arguments: Array) -> list[Array]:
         """`command`, `energy` or `measured` of the law for N rows of arguments."""
-        # Compiled runs have the functions of the law in C, others those of CasADi.
+        # Compiled runs use the law in C, and others use CasADi.
         if self.compiled is not None:
             return self.compiled.rows(name, *arguments)
         controller = self.loop.controller
@@ -408,18 +409,18 @@ def simulate_many(
     monitor: Monitor = silent,
     **settings: Any,
 ) -> tuple[Trajectory, ...]:
-    """Simulate one run for each entry of `changes`, which holds the arguments of `simulate` that differ in it.
+    """Simulate one run for each entry of `changes`, which holds the arguments of `simulate` that differ in this run.
 
     Args:
-        controller: as in `simulate`, as are reference and q_start.
+        controller: as in `simulate`.
         reference: the motion to follow.
         q_start: joint positions at t = 0, (n,) [rad] or [m].
         changes: for each run, arguments of `simulate` by name: plant, pushes, friction, noise, controller, q_start, ...
-        executor: shares the runs, for example `concurrent.futures.ProcessPoolExecutor`, or
-            `distributed.Client(...).get_executor(pure=False)` of Dask. Default: this process, with as many threads as
-            OMP_NUM_THREADS or the number of cores says where runs are compiled.
-        monitor: called with progress.
-        settings: further arguments of `simulate` that all runs share, such as `control_rate` and `compiled`. With
+        executor: distributes the runs, for example `concurrent.futures.ProcessPoolExecutor`, or
+            `distributed.Client(...).get_executor(pure=False)` of Dask. Default: this process. Compiled runs then use
+            OMP_NUM_THREADS threads, or one per core.
+        monitor: receives progress.
+        settings: further arguments of `simulate` for all runs, such as `control_rate` and `compiled`. With
             `compiled=True`, runs that differ in masses, friction, gains or sizes of pushes share one library.
 
     Returns:
@@ -427,8 +428,8 @@ def simulate_many(
 
     Raises:
         UnknownNameError: if `simulate` has no such argument.
-        UnreachableReferenceError, ShapeError, InvalidValueError, CompileError: as `simulate`.
-        Interrupted: after Ctrl-C; its `result` has the trajectories that were ready.
+        UnreachableReferenceError, ShapeError, InvalidValueError, CompileError: as in `simulate`.
+        Interrupted: after Ctrl-C; its `result` has the finished trajectories.
 
     Example:
         >>> import orthocas as oc
@@ -453,7 +454,7 @@ def simulate_many(
     if executor is not None:
         return _share_runs(executor, [partial(simulate, **call) for call in calls], monitor)
 
-    # CasADi must not build functions in threads.
+    # Prepare all runs in this thread, because CasADi must not build functions in several threads.
     runs = []
     for call in calls:
         named = {**_DEFAULTS, **call}
@@ -478,7 +479,7 @@ def _share_runs(
     futures = [executor.submit(run) for run in runs]
     try:
         for done, future in enumerate(as_completed(futures), start=1):
-            # A run that fails ends all.
+            # If a run fails, stop all.
             future.result()
             _report(monitor, done, len(runs))
         return tuple(future.result() for future in futures)

@@ -1,4 +1,4 @@
-"""A plant whose joints stick: dry friction with an exact standstill, by time stepping."""
+"""A plant whose joints stick: dry friction with exact standstill, by time stepping."""
 
 from __future__ import annotations
 
@@ -22,29 +22,30 @@ class StickingRules:
 
     timestep: float = 2.5e-4  #: longest step of the physics [s]
     runaway: float = 1e6  #: velocity [rad/s] or [m/s]
-    blocks: int = 10  #: rounds of the pivoting in which all joints change at once; then one by one, which always ends
-    rounds: int = 1000  #: of the pivoting, in all
+    #: rounds of pivoting that change all joints at once; later rounds change one joint each, which always terminates
+    blocks: int = 10
+    rounds: int = 1000  #: largest number of rounds of the pivoting
 
 
 RULES = StickingRules()
 
 
 class StickingPlant(Shown):
-    """A robot that holds a torque for a tick, with joints that stick: exactly at rest until the torque breaks them off.
+    """A robot that holds a torque for a tick. Its joints stick: they stay exactly at rest until breakaway.
 
-    M ddq + C dq + g = clip(torque) + loads - viscous dq - f, with the dry friction f of `Friction`: |f_i| is at most
-    the breakaway torque where dq_i = 0, and f_i has the size F_i(dq_i) and the direction of dq_i where it is not. A
-    step of length h finds the velocities after it as the minimum of a convex function,
+    M ddq + C dq + g = clip(torque) + loads - viscous dq - f, with the dry friction f of `Friction`. If dq_i = 0, |f_i|
+    is at most the breakaway torque; otherwise f_i has the size F_i(dq_i) and the sign of dq_i. A step of length h
+    computes the new velocities as the minimum of a convex function,
 
         dq+ = argmin_v 1/2 v^T (M + h B) v - (M dq + h (torque - C dq - g))^T v + h sum_i F_i |v_i|,
 
-    at the position in the middle of the step, whose kinks at v_i = 0 are joints that stick. Steps are of first order,
-    and there is no smoothed sign, no stiffness of contacts and no creep. Joints do not stop at their limits.
+    evaluated at the position in the middle of the step. Joints at the kinks v_i = 0 stick. The steps are of first
+    order. There is no smoothed sign function, no contact stiffness and no creep. Joints do not stop at their limits.
 
     Args:
         robot: the true robot.
-        friction: of the joints; default none.
-        effort_limits: whether the motors saturate at the robot's limits of effort.
+        friction: joint friction; default: none.
+        effort_limits: whether motors saturate at the robot's effort limits.
         timestep: longest step of the physics [s].
 
     Raises:
@@ -91,27 +92,27 @@ class StickingPlant(Shown):
         return {"plant": f"{self.robot.heading}, with joints that stick", "time": f"{self.time:g} s", "q": q, "dq": dq}
 
     def reset(self, q: ArrayLike, dq: ArrayLike | None = None) -> None:
-        """Begin anew at joint positions (n,) and velocities (n,), default at rest, at time 0.
+        """Restart at joint positions (n,) and velocities (n,) (default: at rest), at time 0.
 
         Raises:
-            ShapeError, InvalidValueError: for other states.
+            ShapeError, InvalidValueError: for invalid states.
         """
         n = self.robot.n
         self.q: Array = np.array(as_point("q", q, n))  #: joint positions (n,) [rad] or [m]
         #: joint velocities (n,) [rad/s] or [m/s]; exactly 0 where a joint sticks
         self.dq: Array = np.zeros(n) if dq is None else np.array(as_point("dq", dq, n))
-        self.time = 0.0  #: since `reset` [s]
+        self.time = 0.0  #: [s] since `reset`
 
     def step(self, torque: ArrayLike, seconds: float, loads: ArrayLike | None = None) -> None:
         """Hold a torque for some time.
 
         Args:
-            torque: of the motors, (n,) [N m] or [N].
-            seconds: > 0 [s]; divided into equal steps of the physics, none longer than `timestep`.
-            loads: further joint torques, which do not saturate, (n,) [N m] or [N].
+            torque: motor torque, (n,) [N m] or [N].
+            seconds: > 0 [s]; divided into equal physics steps, none longer than `timestep`.
+            loads: additional joint torques, which do not saturate, (n,) [N m] or [N].
 
         Raises:
-            ShapeError, InvalidValueError: for torques that are not (n,) or not finite, and ticks that are too long.
+            ShapeError, InvalidValueError: for torques that are not (n,) or not finite, and for ticks that are too long.
             SimulationError: if the state has diverged.
         """
         applied = np.clip(as_point("torque", torque, self.robot.n), -self._limit, self._limit)
@@ -120,7 +121,7 @@ class StickingPlant(Shown):
         steps = count_steps(seconds, self._timestep)
         h, q, dq = seconds / steps, self.q, self.dq
         for _ in range(steps):
-            # Mass matrix and bias at the position in the middle, and the friction that goes with the last velocity.
+            # Mass matrix and bias at the middle position, and friction at the last velocity.
             middle = q + h / 2 * dq
             M, bias = (out[0] for out in self._dynamics(middle[None], dq[None]))
             size = self._coulomb + self._extra * np.exp(-((dq / self._speed) ** 2))
@@ -134,18 +135,19 @@ class StickingPlant(Shown):
 
 
 def minimise_with_kinks(A: Array, b: Array, size: Array, start: Array) -> Array:
-    """The v with the least 1/2 v^T A v - b^T v + sum_i size_i |v_i|, for A symmetric positive definite, size >= 0.
+    """The minimiser v of 1/2 v^T A v - b^T v + sum_i size_i |v_i|, for A symmetric positive definite, size >= 0.
 
-    At the minimum each v_i is 0 with |b_i - (A v)_i| <= size_i, or has the sign s_i and b_i - (A v)_i = s_i size_i.
-    Signs are guessed, here those of a start, and corrected where one of these conditions is violated: all at once, and
-    if that does not end, the last violated one only, which always ends, since every principal minor of A is positive.
+    At the minimum, each v_i either is 0 with |b_i - (A v)_i| <= size_i, or has a sign s_i and b_i - (A v)_i = s_i
+    size_i. The signs start from those of `start`, and are corrected where a condition is violated. The first rounds
+    correct all signs at once. Later rounds correct only the last violated one, which always terminates because every
+    principal minor of A is positive.
     """
     signs = np.where(size > 0, np.sign(start), 1.0)
     for k in range(RULES.rounds):
         v = np.zeros_like(b)
         moves = np.flatnonzero(signs)
         v[moves] = np.linalg.solve(A[np.ix_(moves, moves)], (b - signs * size)[moves])
-        # What sticks and must not, and what moves against its sign.
+        # Joints that must break away, and joints that move against their sign.
         rest = b - A @ v
         breaks, turns = (signs == 0) & (np.abs(rest) > size), signs * v * (size > 0) < 0
         wrong = np.flatnonzero(breaks | turns)
@@ -153,4 +155,4 @@ def minimise_with_kinks(A: Array, b: Array, size: Array, start: Array) -> Array:
             return v
         changed = wrong if k < RULES.blocks else wrong[-1:]
         signs[changed] = np.where(signs[changed] == 0, np.sign(rest[changed]), 0.0)
-    raise SimulationError("the joints that stick were not found")
+    raise SimulationError("no consistent set of sticking joints was found")

@@ -54,14 +54,14 @@ _ARRAYS = {  #: array fields and their units
     "dissipated_power": "W",
     "cause": "orthocas.control.ControlStatus",
 }
-_LATER = ("cause",)  #: arrays that older files do not have
-_SINGLE = ("times", "status", "storage", "dissipated_power", "cause")  #: one number at each instant
-_OF_JOINTS = ("q", "dq", "command")  #: one number for every joint; the others for every label
+_LATER = ("cause",)  #: arrays that files of older versions lack
+_SINGLE = ("times", "status", "storage", "dissipated_power", "cause")  #: arrays with one number per instant
+_OF_JOINTS = ("q", "dq", "command")  #: arrays with one number per joint; the others have one per label
 _REQUIRED = tuple(name for name in _ARRAYS if name not in _LATER)
 
 
 def read_run_file(path: Path) -> tuple[dict[str, Any], dict[str, Stored]]:
-    """Header and arrays of a run, later ones if the file has them; other entries are left alone.
+    """Header and arrays of a run; newer arrays are optional, and unknown entries are ignored.
 
     Raises:
         TrajectoryFileError: if the file is missing, damaged, foreign or from a newer version.
@@ -87,8 +87,8 @@ class Outcome(Enum):
 
     COMPLETE = "complete"
     INTERRUPTED = "interrupted"  #: by Ctrl-C; the arrays end at that point
-    DIVERGED = "diverged"  #: the integrator gave up; the arrays end at that point
-    LOST = "lost"  #: the law lost the arm, see `Trajectory.reason`; the arrays last to the end
+    DIVERGED = "diverged"  #: the integrator failed; the arrays end at that point
+    LOST = "lost"  #: the law lost the arm, see `Trajectory.reason`; the arrays are complete
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -113,39 +113,39 @@ class Trajectory(Shown):
     reference_velocity: Array  #: (N, k)
     reference_acceleration: Array  #: (N, k)
     storage: Array  #: (N,) V [J]; NaN for velocity controllers
-    dissipated_power: Array  #: (N,) dissipated by the controller's damping [W]; NaN for velocity controllers
-    cause: Array  #: (N,) why the catcher of a supervised law took over last, `ControlStatus`; OK if it never did
-    reason: str = ""  #: of the outcome LOST, in words
+    dissipated_power: Array  #: (N,) power dissipated by the controller's damping [W]; NaN for velocity controllers
+    cause: Array  #: (N,) reason of the last catch of a supervised law, `ControlStatus`; OK if there was none
+    reason: str = ""  #: reason of the outcome LOST, in words
 
     @property
     def energy_balance(self) -> Array:
         """V(t) - V(0) + the energy dissipated until t, (N,) [J].
 
-        It is 0 for impedance control and PD+ (coupled) while the reference is at rest, in continuous time with the true
-        model and without friction, pushes, noise, or commands that were clipped or replaced by the fallback.
+        For impedance control and PD+ (coupled), it is 0 while the reference is at rest, in continuous time, with the
+        exact model, and without friction, pushes, noise, limited commands and fallback.
         """
         lost = scipy.integrate.cumulative_simpson(self.dissipated_power, x=self.times, initial=0.0)
         return np.asarray(self.storage - self.storage[0] + lost)
 
     @property
     def fell_back(self) -> NDArray[np.bool_]:
-        """Where the command was the fallback instead of the law's, (N,)."""
+        """Whether the command was the fallback instead of the law's, (N,)."""
         return ~np.isin(self.status, FROM_THE_LAW)
 
     @property
     def saturated(self) -> NDArray[np.bool_]:
-        """Where the limit cut the command of the law, (N,)."""
+        """Whether the limit cut the command of the law, (N,)."""
         return np.asarray(self.status == ControlStatus.SATURATED)
 
     @property
     def seconds_in_status(self) -> dict[ControlStatus, float]:
-        """How long each status lasted that occurred [s]; a status holds until the next instant."""
+        """Duration of each status that occurred [s]; a status holds until the next instant."""
         lasting = np.diff(self.times)
         return {ControlStatus(int(s)): float(lasting[self.status[:-1] == s].sum()) for s in np.unique(self.status)}
 
     @property
     def catches(self) -> tuple[tuple[float, ControlStatus], ...]:
-        """When the catcher of a supervised law took over [s], and why; OK: the run began too near the boundary."""
+        """Times of catches of a supervised law [s], with reasons; OK: the run started too near the boundary."""
         caught = self.status == ControlStatus.CAUGHT
         first = np.flatnonzero(caught & ~np.concatenate([[False], caught[:-1]]))
         return tuple((float(self.times[i]), ControlStatus(int(self.cause[i]))) for i in first)
@@ -181,25 +181,26 @@ class Trajectory(Shown):
         """Quantities, joints and commands over time, as a matplotlib figure.
 
         Args:
-            units: units of the quantities by label, as `orthocas.simulation.figure.units_of(problem)` has them.
+            units: units of the quantities by label, as from `orthocas.simulation.figure.units_of(problem)`.
         """
-        from orthocas.simulation.figure import trajectory_figure  # with matplotlib, which takes long to import
+        # matplotlib takes long to import.
+        from orthocas.simulation.figure import trajectory_figure
 
         return trajectory_figure(self, units)
 
     def save(self, path: str | Path, force: bool = False) -> None:
-        """Write an NPZ file with all arrays, names and units. The file appears whole or not at all.
+        """Write an NPZ file with all arrays, names and units. The file appears complete or not at all.
 
-        It replaces a trajectory file of that name, and with `force` any other file.
+        It replaces a trajectory file of the same name; with `force` also any other file.
 
         Raises:
-            TrajectoryFileError: if the folder is missing or not writable, or there is a file that is not a trajectory,
-                or a symbolic link.
+            TrajectoryFileError: if the folder is missing or not writable, or the path is a symbolic link or a file that
+                is not a trajectory.
         """
         target = as_path("path", path)
         require_writable(target, TrajectoryFileError)
         require_replaceable(target, is_numpy_archive(target, ("header", *_REQUIRED)), force, TrajectoryFileError)
-        # A header for what is no array, beside the arrays.
+        # The header holds everything that is not an array.
         header = {
             "version": _VERSION,
             "controller": self.controller,
@@ -224,7 +225,7 @@ class Trajectory(Shown):
         path = as_path("path", path)
         header, arrays = read_run_file(path)
         try:
-            # The header first: it says which shapes the arrays must have.
+            # Read the header first, because it determines the shapes of the arrays.
             names: dict[str, Any] = {name: tuple(get_part(header, name, list)) for name in ("labels", "joint_names")}
             for what, texts in names.items():
                 if not texts:
@@ -247,8 +248,8 @@ class Trajectory(Shown):
 
 
 def _check_arrays(arrays: Mapping[str, Any], n: int, k: int) -> dict[str, Any]:
-    """The arrays of a run of n joints and k quantities, with shapes that fit and instants that increase."""
-    # One row for each instant, as wide as its kind of quantity.
+    """Check the arrays of a run of n joints and k quantities: shapes, and increasing times."""
+    # One row per instant, as wide as the kind of quantity.
     N = arrays["times"].size
     checked: dict[str, Any] = {}
     for name, array in arrays.items():
@@ -268,23 +269,23 @@ assert set(_ARRAYS) < {field.name for field in fields(Trajectory)}
 
 
 def find_loss(run: Trajectory, controller: Controller, pushes: Sequence[Push], supervised: bool) -> str:
-    """Why a law lost its arm in a run, in words; empty if it kept it.
+    """Find why a law lost the arm in a run; returns the reason in words, empty if it kept the arm.
 
-    A law loses its arm in two ways. The arm leaves the domain of the law's chart, outside of which the law commands
-    nothing; for a law without a chart, the joint limits. A supervised law may come back, and its catcher may hold the
-    arm outside.
+    A law loses the arm in two ways. First, the arm leaves the domain of the law's chart, outside of which the law
+    commands nothing, or the joint limits if the law has no chart. A supervised law may return from there, and its
+    catcher may hold the arm outside.
 
-    Or motors are at their limit for a time, after which the storage V, the energy of springs and motion, is larger than
-    before. This counts if that time lasts to the end of the run, or if the catcher of a supervised law took over during
-    it without a push.
+    Second, motors are saturated for some time, and afterwards the storage V (the energy of springs and motion) is
+    larger than before. This counts if the saturation lasts to the end of the run, or if the catcher of a supervised law
+    took over during it without a push.
 
     Args:
         run: the run, in the quantities of the law.
         controller: the law.
-        pushes: that acted on the arm.
-        supervised: whether its supervised form ran.
+        pushes: pushes on the arm.
+        supervised: whether the law was supervised.
     """
-    # At which instants the arm is outside what the law respects, (N,).
+    # Instants at which the arm is outside, (N,).
     if controller.chart is not None:
         outside, what = np.asarray(~controller.problem.domain.contains(run.q)), "the domain of the chart"
     else:
@@ -297,7 +298,7 @@ def find_loss(run: Trajectory, controller: Controller, pushes: Sequence[Push], s
         left = "was outside" if first == 0 else "left"
         return f"the arm {left} {what} at t = {run.times[first]:.4g} s"
 
-    # Inside, but the motors are at their limit and the errors grow.
+    # Look for intervals inside with saturated motors and growing errors.
     at_limit = np.abs(run.command) >= controller.gains["limit"]
     for first, last in _find_stretches(np.asarray(at_limit.any(axis=1))):
         since, until = run.times[[first, last]]
@@ -311,7 +312,7 @@ def find_loss(run: Trajectory, controller: Controller, pushes: Sequence[Push], s
 
 
 def _find_stretches(true: NDArray[np.bool_]) -> Iterator[tuple[int, int]]:
-    """First and last index of every run of true entries."""
+    """First and last index of every run of consecutive true entries."""
     edges = np.flatnonzero(np.diff(np.concatenate([[False], true, [False]]).astype(int)))
     for first, end in edges.reshape(-1, 2).tolist():
         yield first, end - 1
@@ -325,11 +326,11 @@ class Coupling(Shown):
     index: Array  #: (n, n) [unit of the row / unit of the column]; NaN where a coordinate was never commanded alone
 
     def of(self, disturbed: str, commanded: str) -> float:
-        """The index of one pair of labels: how much steps of the second coordinate disturb the first."""
+        """The index of a pair of labels: how much steps of `commanded` disturb `disturbed`."""
         return float(self.index[self.labels.index(disturbed), self.labels.index(commanded)])
 
     def facts(self) -> dict[str, str]:
-        """The coordinate that each commanded coordinate disturbs most."""
+        """For each commanded coordinate, the one that it disturbs most."""
         known = [j for j in range(len(self.labels)) if np.isfinite(self.index[:, j]).any()]
         worst = {j: int(np.nanargmax(self.index[:, j])) for j in known}
         found = {f"steps of {self.labels[j]}": f"{self.index[i, j]:.3g} in {self.labels[i]}" for j, i in worst.items()}
@@ -339,9 +340,9 @@ class Coupling(Shown):
 def coupling_index(chart: Chart, reference: Reference, trajectory: Trajectory) -> Coupling:
     """Largest deviation of each coordinate while only one other is commanded, divided by the commanded step.
 
-    Deviations are measured from the reference. Steps that change several targets at once are left out; of several steps
-    in one coordinate, the worst counts. Motion left over from an earlier step counts too, so let the arm come to rest
-    between steps.
+    Deviations are measured from the reference. Steps that change several targets at once are ignored. For several steps
+    of one coordinate, the worst counts. Motion that remains from an earlier step counts too, so let the arm come to
+    rest between steps.
 
     Args:
         chart: the chart whose coordinates are evaluated, even if the controller does not use them.
@@ -358,10 +359,10 @@ def coupling_index(chart: Chart, reference: Reference, trajectory: Trajectory) -
     require_kind("reference", reference, Reference)
     require_kind("trajectory", trajectory, Trajectory)
     if reference.labels != chart.labels:
-        raise InvalidValueError("labels of the reference", reference.labels, f"those of the chart {chart.labels}")
+        raise InvalidValueError("labels of the reference", reference.labels, f"the labels {chart.labels} of the chart")
     wanted = reference.sample(np.minimum(trajectory.times, reference.duration))[0]
     away = np.abs(wrap_shortest(chart.phi(trajectory.q) - wanted, chart.parts.turns))
-    # Between two steps of the reference, only the commanded coordinates should move.
+    # Between two steps, only the commanded coordinate should move.
     steps = np.diff(np.vstack([reference.start, reference.targets]), axis=0)
     index = np.full((chart.n, chart.n), np.nan)
     for segment, step in enumerate(steps):
@@ -377,7 +378,7 @@ def coupling_index(chart: Chart, reference: Reference, trajectory: Trajectory) -
 
 @dataclass(frozen=True, eq=False)
 class Breakdown:
-    """Terms of the task acceleration dd_x along a run, each (N, m). They add up to dd_x."""
+    """Terms of the task acceleration dd_x along a run, each (N, m), which sum to dd_x."""
 
     labels: tuple[str, ...]  #: of x
     own: Array = field(repr=False)  #: J_x M^-1 J_x^T f_x, the effect of the task force
@@ -394,7 +395,7 @@ class Breakdown:
 def task_acceleration_breakdown(chart: Chart, trajectory: Trajectory) -> Breakdown:
     """Split dd_x into the terms of the first rows of [AS2023] eq. (34), with f_phi = J^-T (tau - g).
 
-    The terms use the controller's model of the robot and leave out pushes and friction.
+    The terms use the controller's robot model, without pushes and friction.
 
     Args:
         chart: the chart whose coordinates define the terms.

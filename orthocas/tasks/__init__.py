@@ -1,9 +1,9 @@
-"""What is asked of a robot: tasks h(q), metrics A(q), domains, and problems that join them.
+"""Tasks h(q), metrics A(q), domains, and problems that join them for a robot.
 
-- `task` has tasks, `metric` metrics, `problem` joins them on a domain, and has them as data of files.
-- `domains` has boxes and tori, `clear_box` and `corridor` domains with a condition of their own, `regular_box` the
-  box that is taken by default.
-- `samples` draws sample sets: the data of the loss that do not depend on the coordinates.
+- `task` has tasks and `metric` metrics. `problem` joins them on a domain, and converts problems to file data.
+- `domains` has boxes and tori, `clear_box` and `corridor` domains with an additional condition, `regular_box` the
+  default box.
+- `samples` draws sample sets and evaluates the data of the loss that do not depend on the coordinates.
 """
 
 from orthocas.tasks import clear_box, corridor  # registers their kinds of domain

@@ -1,4 +1,4 @@
-"""Branches of the joint range: what is left of it if it is cut where self-motions cannot pass."""
+"""Branches: the parts into which hypersurfaces cut the joint range where self-motions cannot cross."""
 
 from __future__ import annotations
 
@@ -30,30 +30,31 @@ if TYPE_CHECKING:
 class BranchRules:
     """Numbers of the search for branches, chosen on eight arms."""
 
-    #: relative singular value above which positions count: those of fractions, and of self-motions at cuts
+    #: relative singular value above which a position counts as clear, in fractions of volume and in slices
     nonsingular: float = 0.1
-    #: times the clearance of a wide chart: that of its centre, if the centre of the branch is too singular
+    #: clearance needed at the centre of a wide chart, relative to the chart's clearance
     of_centre: float = 1.5
     slices: int = 61  #: slices q_k = v of a joint
     on_slice: int = 200  #: positions on a slice
     on_fine_slice: int = 400  #: positions on a slice while a cut is refined
     seed: int = 0  #: of all positions
-    few: int = 8  #: positions on a slice; fewer say nothing about it
-    quantile: float = 0.9  #: of the positions of a slice that must be singular, or that self-motions must not leave
-    low: float = 0.12  #: that quantile at a cut, relative to the largest one of the slices of the joint
-    still: float = 0.02  #: joints that self-motions move less are not cut where they move least
-    exact: float = 1e-4  #: the quantile at which a cut is one of geometry, not of offsets between axes
-    apart: float = 0.45  #: [rad or m] cuts of one joint that are nearer are one
-    most_cuts: int = 2  #: of a joint
-    well: float = 0.15  #: the quantile on the best slice of a part that counts
-    well_of_joint: float = 0.6  #: or that quantile relative to the best slice of the joint, if that is less
-    neighbours: int = 5  #: slices on each side of a minimum
-    same_pose: float = 1e-8  #: [m and rad] difference of poses that are equal
+    few: int = 8  #: fewer nonsingular positions on a slice than this say nothing about self-motions
+    quantile: float = 0.9  #: this fraction of a slice must be singular, or must not be left by self-motions
+    low: float = 0.12  #: largest such quantile at a cut, relative to the largest one over the slices of the joint
+    still: float = 0.02  #: no cut of a joint whose self-motions are smaller than this on all slices
+    #: quantile below which a cut is exact, and not only approximate because of offsets between axes
+    exact: float = 1e-4
+    apart: float = 0.45  #: [rad] or [m]; cuts of one joint nearer than this count as one
+    most_cuts: int = 2  #: largest number of cuts of a joint
+    well: float = 0.15  #: a part counts if the quantile on its best slice reaches this value ...
+    well_of_joint: float = 0.6  #: ... or this fraction of the value on the best slice of the joint
+    neighbours: int = 5  #: number of slices on each side that a minimum is compared with
+    same_pose: float = 1e-8  #: [m] and [rad]; poses that differ less are equal
     samples: int = 20_000  #: positions of the joint range
-    drawn: int = 25  #: most positions that are drawn, in those that are asked for
-    centres: int = 20_000  #: positions that may be the centre of a chart
-    surely: float = 3.0  #: times `nonsingular`: a value in the range that makes sure of such a centre on any box
-    arm: int = 7  #: joints of an arm, counted from its tip, whose self-motions are examined
+    drawn: int = 25  #: a sampler draws at most this many times the requested number
+    centres: int = 20_000  #: sampled positions that may be the centre of a chart
+    surely: float = 3.0  #: a value of this many times `nonsingular` in a branch guarantees a centre for any smaller box
+    arm: int = 7  #: number of last joints of an arm whose self-motions are examined
 
 
 RULES = BranchRules()
@@ -68,9 +69,9 @@ class Cut:
     joint: int  #: k
     joint_name: str
     part: str  #: "elbow", ... or the name of the joint
-    value: float  #: [rad] or [m]
-    singular: bool  #: whether its positions are singular; otherwise self-motions cannot leave it
-    exact: bool  #: whether all of its positions are so, not only nearly
+    value: float  #: position of joint k [rad] or [m]
+    singular: bool  #: True: all its positions are singular; False: self-motions cannot leave it
+    exact: bool  #: whether this holds exactly, and not only approximately
 
     @property
     def explained(self) -> str:
@@ -84,22 +85,22 @@ class Branch:
     """A part of the joint range between cuts."""
 
     name: str  #: such as "shoulder+ elbow- wrist+"; "whole" without cuts
-    box: Box  #: up to the joint limits
-    posture: Array  #: its clear position farthest from limits and cuts, (n,)
-    clear_share: float  #: fraction of its positions with a relative singular value above 0.1
-    share: float  #: its fraction of all such positions of the joint range
-    #: the largest up to 0.1 for which some position is nonsingular enough to be the centre of a chart
+    box: Box  #: box from cut to cut, or to the joint limits
+    posture: Array  #: the clear position farthest from limits and cuts, (n,)
+    clear_share: float  #: fraction of its positions that are clear: relative singular value above 0.1
+    share: float  #: its fraction of all clear positions of the joint range
+    #: largest clearance up to 0.1 for which some position can be the centre of a chart
     clearance: float = RULES.nonsingular
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Branches(Shown, Sequence[Branch]):
-    """The branches of a robot, the one with most clear positions first; see `orthocas.branches`."""
+    """The branches of a robot, sorted by their number of clear positions; see `orthocas.branches`."""
 
     robot: Robot
     cuts: tuple[Cut, ...]
     items: tuple[Branch, ...]
-    mirrors: tuple[int, ...]  #: cuts that a reflection of the joints crosses without moving the tip
+    mirrors: tuple[int, ...]  #: indices of cuts at which a reflection of the joints keeps the pose of the tip
 
     def __len__(self) -> int:
         return len(self.items)
@@ -108,37 +109,40 @@ class Branches(Shown, Sequence[Branch]):
         return iter(self.items)
 
     def __getitem__(self, key: int | str) -> Branch:  # type: ignore[override]
-        """A branch by its place or its name."""
+        """A branch by its index or its name."""
         if isinstance(key, str):
             names = [item.name for item in self.items]
             if key not in names:
                 raise UnknownNameError("branch", key, names)
             return self.items[names.index(key)]
         if not isinstance(key, int | np.integer) or not -len(self.items) <= key < len(self.items):
-            raise InvalidValueError("branch", repr(key)[:80], f"a name, or a place among {len(self.items)}")
+            raise InvalidValueError(
+                "branch", repr(key)[:80], f"a name, or an index of one of {len(self.items)} branches"
+            )
         return self.items[key]
 
     def of(self, q: ArrayLike) -> Branch | None:
-        """The branch of a joint position (n,); None outside the joint range, and on parts without clear positions."""
+        """The branch of a joint position (n,); None outside the joint range and on parts without clear positions."""
         point = as_point("q", q, self.robot.n)
         return next((item for item in self.items if item.box.contains(point)), None)
 
     def mirrored(self, q: ArrayLike, cut: int) -> Array:
-        """The joint position (n,) beyond a cut with the same pose of the tip, for cuts among `mirrors`.
+        """The joint position (n,) on the other side of a cut among `mirrors`, with the same pose of the tip.
 
-        q_k - value changes its sign, and its neighbours turn by half a turn, towards the centre of their range.
+        q_k - value changes its sign. The two neighbouring joints turn by half a turn, towards the centre of their
+        ranges.
         """
         q = as_point("q", q, self.robot.n)
         image: Array = _reflect(self.robot, self.cuts[cut], q[None])[0]
         return image
 
     def plot(self) -> Figure:
-        """The posture of each branch, in a panel with its name and its fraction of the clear positions."""
-        from matplotlib.layout_engine import ConstrainedLayoutEngine  # takes long, and searches need no pictures
+        """Draw the posture of each branch in a panel of its own, with name and fraction of the clear positions."""
+        # matplotlib is slow to import, and searches need no pictures.
+        from matplotlib.layout_engine import ConstrainedLayoutEngine
 
         from orthocas.tools.picture import Picture, equal_axes
 
-        # A panel for each branch, with the arm at its posture.
         columns = min(len(self), 4)
         rows = -(-len(self) // columns)
         layout = ConstrainedLayoutEngine(h_pad=0.1, w_pad=0.15, rect=(0, 0, 0.97, 1))
@@ -153,7 +157,7 @@ class Branches(Shown, Sequence[Branch]):
         return figure
 
     def facts(self) -> dict[str, str]:
-        """Cuts and branches, and those that a wide chart of the usual clearance cannot serve."""
+        """Cuts and branches, and the branches too singular for a wide chart with the usual clearance."""
         shares = [f"{item.name} ({percent(item.share)})" for item in self.items]
         facts = {
             "branches": f"{len(self)} of {self.robot.heading}",
@@ -168,28 +172,30 @@ class Branches(Shown, Sequence[Branch]):
 
 
 def branches(robot: Robot, task: Task | None = None) -> Branches:
-    """Find the parts of the joint range between which self-motions and ways around singular positions do not lead.
+    """Find the parts of the joint range that self-motions and paths around singular positions do not connect.
 
-    Cuts are hypersurfaces q_k = v of two kinds. On singular ones, every position is singular, such as those of a
-    stretched elbow. Others are not crossed by self-motions: joint k stands still on them while the arm moves without
-    its tip, as the second joint of a shoulder with three intersecting axes at q2 = 0. A coordinate keeps its sign along
-    self-motions on each side of a cut, and not across it. The search takes slices of every joint but the first and the
-    last of the arm, and refines what it finds; nearly so counts too, because offsets between axes move such places a
-    little. A cut of the second kind does not count if hardly any position between it and the next cut is nonsingular.
-    Cuts are found from samples, not proved.
+    Cuts are hypersurfaces q_k = v of two kinds. On a singular cut, every position is singular; an example is the
+    stretched elbow. On the other kind, joint k does not move during self-motions (motions of the arm with the tip at
+    rest), so self-motions do not cross the cut. An example is the second joint of a shoulder with three intersecting
+    axes at q2 = 0. A coordinate keeps its sign along self-motions on each side of a cut, but not across it.
 
-    Self-motions are those of the tip's pose, by the last seven joints: charts of its position keep to the same cuts.
-    With several tips, they are those of each tip by the last seven joints that carry it, if these move the task.
-    With fewer than six joints they are those of the task. Branches are the parts with positions where the task is
-    clear. Joints that can turn farther than a full turn are taken from -pi to pi.
+    The search takes slices of every joint except the first and the last of the arm, and refines the minima that it
+    finds. A cut may be approximate, because offsets between axes disturb these places a little. A cut of the second
+    kind is dropped if hardly any position between it and the next cut is nonsingular. Cuts are found from samples, not
+    proved.
+
+    The self-motions are those of the tip's pose by the last seven joints; charts of the tip's position use the same
+    cuts. A robot with several tips has self-motions of each tip by the last seven joints that carry it, if these joints
+    move the task. With fewer than six joints, self-motions are those of the task. Branches are the parts that contain
+    clear positions of the task. Joints that can turn more than a full turn are taken from -pi to pi.
 
     Args:
         robot: the robot.
-        task: a task of that robot, needed with fewer than six joints. Default: the pose of the tip, by the last seven
+        task: a task of that robot, required with fewer than six joints. Default: the pose of the tip, by the last seven
             joints.
 
     Raises:
-        SingularTaskError: if no position is clear.
+        SingularTaskError: if no sampled position is clear.
 
     Source:
         ours, docs/how-to/wide.md.
@@ -214,12 +220,14 @@ def branches(robot: Robot, task: Task | None = None) -> Branches:
     else:
         values = np.min([arm.measure_self_motions(points)[0] for arm in arms], axis=0)
     if not (values > RULES.nonsingular).any():
-        raise SingularTaskError("no position of the joint range is clear of singular ones")
+        raise SingularTaskError(
+            "all sampled positions of the joint range are near-singular, expected a task with clear positions"
+        )
     # A joint with k cuts has k + 1 parts, and a branch takes one part of each joint.
     parts = [range(1 + sum(cut.joint == k for cut in cuts)) for k in sorted({cut.joint for cut in cuts})]
     candidates = [_build_branch(whole, cuts, sides, points, values) for sides in product(*parts)]
     items = [item for item in candidates if item]
-    # the clearance that a branch allows, where its values do not make sure of the usual one
+    # Find the clearance that each branch allows, unless its values guarantee the usual one.
     served = task or (arms[0].task if len(arms) == 1 else None)
     if served is not None and served.m < robot.n:
         for k, item in enumerate(items):
@@ -233,7 +241,7 @@ def branches(robot: Robot, task: Task | None = None) -> Branches:
 
 @dataclass(frozen=True, eq=False)
 class _Arm:
-    """The joints whose self-motions are looked at."""
+    """The joints of one arm, for examining its self-motions."""
 
     robot: Robot
     task: Task
@@ -243,20 +251,20 @@ class _Arm:
 
     @classmethod
     def build_all(cls, robot: Robot, task: Task | None, whole: Box) -> list[_Arm]:
-        """The arm of a robot with one tip; of others, those of all tips whose joints move the task."""
-        # One tip: its last seven joints, or the task for shorter arms.
+        """One arm if the robot has one tip; otherwise one arm per tip whose joints move the task."""
+        # One tip: take its last seven joints, or the task if the arm is shorter.
         points = sample_evenly(Box(whole.centre, whole.half_width), 2000, RULES.seed)
         if len(robot.tips) == 1:
             joints = list(range(max(0, robot.n - RULES.arm), robot.n))
             one = Task.pose(robot) if robot.n >= 6 or task is None else task
             return [cls._build(robot, one, whole, joints, points)]
-        # Several tips: each whose joints move the task.
+        # Several tips: take each tip whose joints move the task.
         moved = np.ones(robot.n, dtype=bool)
         if task is not None:
             moved = np.asarray(_evaluate_jacobians(task.with_reference_at(whole.centre), points[:20]).any(axis=(0, 1)))
         arms = []
         for tip in robot.tips:
-            # Joints that move the tip, those that mimic joints follow too, each once.
+            # Joints that move the tip, including leaders of mimic joints, each once.
             bodies = robot.tree.carriers(robot.tree.frame(tip).parent)
             joints = list(dict.fromkeys(robot.tree.leaders[body] for body in bodies))[-RULES.arm :]
             if joints and moved[joints].any():
@@ -271,11 +279,11 @@ class _Arm:
 
     @property
     def inner(self) -> list[int]:
-        """The joints that may be cut: turning the base or the tool changes nothing."""
+        """The joints that may have cuts: all but the first and the last, which turn the base and the tool only."""
         return self.joints[1:-1]
 
     def measure_self_motions(self, points: Array) -> tuple[Array, Array]:
-        """Relative singular values (N,), and how far unit self-motions move each joint, (N, n); NaN without any."""
+        """Relative singular values (N,), and displacements of joints in a unit self-motion, (N, n), NaN without one."""
         J = _evaluate_jacobians(self.task, points)[:, :, self.joints] / self.scale[:, None]
         m = J.shape[1]
         moved = np.full(points.shape, np.nan)
@@ -291,11 +299,11 @@ class _Arm:
         values = np.linspace(low, high, RULES.slices)
         cuts: list[tuple[Cut, float]] = []
         of_slices = np.array([self._measure_slice(k, v, RULES.on_slice) for v in values])
-        # Minima over the slices are refined, singular ones first, and those near another cut are dropped.
+        # Refine the minima over the slices, singular cuts first. Drop a cut near another one.
         for singular, sizes in zip((True, False), of_slices.T, strict=True):
             if not np.isfinite(sizes).any() or (not singular and np.nanmax(sizes) < RULES.still):
                 continue
-            # inner slices that are the lowest of their neighbours and low, the lowest first
+            # Inner slices that are lowest among their neighbours and low enough, in ascending order.
             low_enough, near = RULES.low * float(np.nanmax(sizes)), RULES.neighbours
             minima = [
                 i
@@ -306,14 +314,14 @@ class _Arm:
                 cut, size = self._refine_cut(k, values, i, singular)
                 if all(abs(cut.value - other.value) > RULES.apart for other, _ in cuts):
                     cuts.append((cut, size))
-        # Few cuts are kept, and none that is not singular beside a part with hardly any nonsingular slice.
+        # Keep the strongest cuts. Drop nonsingular cuts beside a part with hardly any nonsingular slice.
         strongest = sorted(cuts, key=lambda pair: pair[1])[: RULES.most_cuts]
         while weakest := _find_sliver_cut(strongest, low, high, values, of_slices[:, 0]):
             strongest.remove(weakest)
         return sorted((cut for cut, _ in strongest), key=lambda cut: cut.value)
 
     def _measure_slice(self, k: int, value: float, count: int) -> tuple[float, float]:
-        """The 90 % quantiles, over a slice, of the singular value, and of how far self-motions move the joint."""
+        """90 % quantiles over a slice: of the singular value, and of the joint's displacement in unit self-motions."""
         points = sample_evenly(Box(self.whole.centre, self.whole.half_width), count, (RULES.seed, k))
         points[:, k] = value
         s, moved = self.measure_self_motions(points)
@@ -328,7 +336,7 @@ class _Arm:
             quantile = self._measure_slice(k, value, RULES.on_fine_slice)[0 if singular else 1]
             return quantile if np.isfinite(quantile) else 1.0
 
-        # Cuts of geometry lie at zero for most robots, which is more exact than what the search ends with.
+        # On most robots exact cuts lie at zero, so try zero besides the result of the minimisation.
         minimum = scipy.optimize.minimize_scalar(
             size, bounds=(values[i - 1], values[i + 1]), method="bounded", options={"xatol": 1e-6}
         )
@@ -344,7 +352,7 @@ class _Arm:
 def _find_sliver_cut(
     cuts: list[tuple[Cut, float]], low: float, high: float, values: Array, sizes: Array
 ) -> tuple[Cut, float] | None:
-    """The weakest cut, of those that self-motions do not cross, that bounds a part with hardly any clear slice."""
+    """The weakest nonsingular cut that bounds a part with hardly any clear slice; None if there is no such cut."""
     placed = sorted(cuts, key=lambda pair: pair[0].value)
     ends = [low, *(cut.value for cut, _ in placed), high]
     enough = min(RULES.well, RULES.well_of_joint * float(sizes.max()))
@@ -354,14 +362,14 @@ def _find_sliver_cut(
 
 
 def sample_nonsingular(robot: Robot, task: Task, box: Box, samples: int, seed: int | tuple[int, ...]) -> Array:
-    """Uniform clear positions of a box, (N, n); `branches` counts the same positions as clear.
+    """Uniform clear positions of a box, (N, n), with the same meaning of clear as in `branches`.
 
     Args:
         robot: the robot.
         task: a task of that robot.
-        box: its positions.
-        samples: N, or less if fewer than one in 25 is clear.
-        seed: of the positions.
+        box: the box to draw from.
+        samples: N; fewer are returned if less than one in 25 positions is clear.
+        seed: seed of the random positions.
     """
     values, rng = _scale_to_range(robot, task), np.random.default_rng(seed)
     kept, count = [np.empty((0, robot.n))], 0
@@ -375,13 +383,13 @@ def sample_nonsingular(robot: Robot, task: Task, box: Box, samples: int, seed: i
 
 
 def sample_centres(robot: Robot, task: Task, box: Box) -> tuple[Array, Array]:
-    """Positions of a box (N, n), and their relative singular values with rows scaled over the joint range, (N,)."""
+    """Positions of a box (N, n) and their relative singular values (N,), with rows scaled over the joint range."""
     points = sample_evenly(Box(box.centre, box.half_width), RULES.centres, RULES.seed)
     return points, _scale_to_range(robot, task)(points)
 
 
 def build_clear_box(robot: Robot, task: Task, box: Box, clearance: float, home: Array | None = None) -> ClearBox:
-    """The positions of a box that are clear as `branches` counts them: rows are scaled over the joint range.
+    """The clear part of a box, with the same meaning of clear as in `branches`.
 
     Raises:
         DomainError: if the home, by default the centre, is not clear.
@@ -390,7 +398,7 @@ def build_clear_box(robot: Robot, task: Task, box: Box, clearance: float, home: 
 
 
 def _compute_range_scale(robot: Robot, task: Task) -> Array:
-    """The sizes of the rows of the frame Jacobian in the joint range, (m,), by which lengths and angles compare."""
+    """Root mean square lengths of the rows of the frame Jacobian over the joint range, (m,), to compare units."""
     whole = find_joint_range(robot, 0)
     centred = task.with_reference_at(whole.centre)
     samples = sample_evenly(Box(whole.centre, whole.half_width), RULES.samples, RULES.seed)
@@ -416,8 +424,8 @@ def _evaluate_jacobians(task: Task, points: Array) -> Array:
 def _build_branch(
     whole: Box, cuts: tuple[Cut, ...], sides: tuple[int, ...], points: Array, values: Array
 ) -> Branch | None:
-    """The branch on some sides of the cuts; None if it has no clear sample."""
-    # Each side is the part of a joint between two of its cuts, or between a cut and a limit.
+    """The branch between the cuts that `sides` selects; None if it has no clear sample."""
+    # Side k of a joint is the interval between its cuts k - 1 and k; the first and last sides end at a limit.
     low, high = whole.centre - whole.half_width, whole.centre + whole.half_width
     clear, words = points[values > RULES.nonsingular], []
     for k, side in zip(sorted({cut.joint for cut in cuts}), sides, strict=True):
@@ -427,7 +435,7 @@ def _build_branch(
         if side < len(own):
             high[k] = own[side].value
         words.append(own[0].part + ("-", "+")[side] if len(own) == 1 else own[0].part + ("-", "0", "+")[side])
-    # The box, its fractions, and the nonsingular position farthest from all its boundaries.
+    # Find the clear position farthest from all boundaries.
     inside = clear[((clear > low) & (clear < high)).all(axis=1)]
     if not len(inside):
         return None
@@ -439,7 +447,7 @@ def _build_branch(
 
 
 def _reflect(robot: Robot, cut: Cut, points: Array) -> Array:
-    """Points (N, n) on the other side of a cut, the neighbours of its joint turned by half a turn."""
+    """Reflect points (N, n) at a cut: joint k changes sign about it, and its neighbours turn by half a turn."""
     k = cut.joint
     moved = points.copy()
     moved[:, k] = 2 * cut.value - points[:, k]
@@ -452,12 +460,12 @@ def _reflect(robot: Robot, cut: Cut, points: Array) -> Array:
 
 def _is_mirror(robot: Robot, cut: Cut, points: Array) -> bool:
     """Whether the reflection at a cut keeps the pose of the tip."""
-    # A reflection needs exact cuts, and revolute joints beside them.
+    # A reflection needs an exact cut, with revolute joints beside it.
     prismatic = robot.tree.prismatic
     near = [j for j in (cut.joint - 1, cut.joint, cut.joint + 1) if 0 <= j < robot.n]
     if not cut.exact or any(prismatic[j] for j in near):
         return False
-    # All tips keep their positions and rotations at the samples.
+    # All tips must keep their positions and rotations at the samples.
     moved = _reflect(robot, cut, points)
     same = [
         np.abs(of(points, tip) - of(moved, tip)).max() < RULES.same_pose

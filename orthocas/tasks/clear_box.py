@@ -23,19 +23,21 @@ from orthocas.tools.columns import BlockedFunction
 from orthocas.tools.json import get_part
 
 CLEAR_BOX = "clear box"  #: name of the kind
-ROWS = ("frame", "x")  #: Jacobians by which a position is evaluated
+ROWS = ("frame", "x")  #: Jacobians whose rows may define the singular values
 
 
 @dataclass(frozen=True, slots=True)
 class ClearBoxRules:
     """Sample sizes of a `ClearBox`."""
 
-    samples: int = 256  #: of the box, for the scale of the rows
-    fraction_samples: int = 20_000  #: of the box, for the fraction of it that is nonsingular
-    default_samples: int = 4096  #: of the default box, to see whether it holds near-singular positions
-    near: float = 0.03  #: relative singular value below which it does: charts of the whole box would fold there
-    centre_share: float = 0.6  #: bound of the part that is the default domain then, over the value at the centre
-    largest_bound: float = 0.2  #: and the largest such bound
+    samples: int = 256  #: of the box, to find the scale of the rows
+    fraction_samples: int = 20_000  #: of the box, to find the clear fraction
+    default_samples: int = 4096  #: of the default box, to find near-singular positions
+    #: relative singular value below which a position is near-singular: charts of the whole box would fold there
+    near: float = 0.03
+    #: bound of a default domain with near-singular positions, relative to the value at the centre ...
+    centre_share: float = 0.6
+    largest_bound: float = 0.2  #: ... and the largest such bound
     seed: int = 0
 
 
@@ -48,14 +50,14 @@ class ClearBox(Box):
     """All q of a box at which the relative singular value of a task is above a bound (ours).
 
     The relative singular value s(q) is the smallest singular value of D^-1 J(q), without units. For orientation, pose
-    and axis tasks, J is the frame Jacobian: velocity and angular velocity of the tip in its own axes. So s(q) belongs
-    to the robot, and does not depend on a reference orientation. For other tasks, J is J_x. D is diagonal: rows with
-    the same unit are divided by their root mean square length over the box, so s = 1 is as regular as the task usually
-    is, and s = 0 is singular. Prismatic joints count 1 m like 1 rad. s(q) > bound holds just where
-    D^-1 J J^T D^-1 - bound^2 I is positive definite, so guards test the m pivots of its elimination.
+    and axis tasks, J is the frame Jacobian: velocity and angular velocity of the tip in its own axes. So s(q) depends
+    on the robot only, and not on a reference orientation. For other tasks, J is J_x. D is diagonal: it divides rows
+    with the same unit by their root mean square length over the box. So s = 1 is as regular as usual for the task, and
+    s = 0 is singular. A prismatic joint's 1 m counts like 1 rad. s(q) > bound holds exactly where D^-1 J J^T D^-1 -
+    bound^2 I is positive definite, so checks test the signs of its m elimination pivots.
 
-    Half a turn of the tool from the reference, x itself ends although the robot may be clear, and J_x loses rank. Laws
-    for tasks of one axis report SINGULAR close to it; rows="x" keeps a domain away from it.
+    Half a turn away from the reference, x itself ends and J_x loses rank, although the robot may be in a clear
+    position. Laws for tasks of one axis report SINGULAR close to it. With rows="x" the domain keeps away from it.
 
     `Problem(..., least_singular_value=bound)` builds it.
 
@@ -64,9 +66,9 @@ class ClearBox(Box):
         task: the task.
         least_singular_value: the bound, > 0.
         scale: the diagonal of D, (m,) > 0, in m and rad per rad. Default: from 256 samples of the box.
-        rows: the rows J: "frame" as above; "x" for J_x of all tasks, as older chart files mean it, which also leaves
-            out what is near half a turn from the reference.
-        home: a clear position of the box, (n,), where motions and signs begin. Default: the centre.
+        rows: "frame" for the rows J above; "x" for J_x of every task, which also excludes positions near half a turn
+            from the reference. Older chart files use "x".
+        home: a clear position of the box, (n,), where motions and references start. Default: the centre.
 
     Raises:
         DomainError: if the home lies outside the box or is not clear.
@@ -100,14 +102,13 @@ class ClearBox(Box):
         require_kind("box", box, Box)
         require_kind("task", task, Task)
         require_known("rows", rows, ROWS)
-        # The frame Jacobian decides unless `rows` says otherwise.
         super().__init__(box.centre, box.half_width, box.unbounded)
         posture = None if home is None else freeze_array("home", home, self.centre.shape)
         object.__setattr__(self, "posture", posture)
         task = task.with_reference_at(self.home)
         object.__setattr__(self, "task", task)
         object.__setattr__(self, "rows", rows)
-        # Sizes are those of its rows at samples of the box where they are finite.
+        # By default the scale comes from the finite rows at samples of the box.
         if scale is None:
             J = self._evaluate_jacobians(sample_uniform(Box(self.centre, self.half_width), RULES.samples, RULES.seed))
             finite = np.isfinite(J).all(axis=(1, 2))
@@ -136,9 +137,9 @@ class ClearBox(Box):
 
     @property
     def heading(self) -> str:
-        """The condition in one line, with the lengths by which rows are divided."""
+        """The condition in one line, with the scale of the rows."""
         rows = "J_x" if self.jacobian_function is self.task.jacobian_function else "the frame Jacobian"
-        # For example '0.41 m, 1.53 rad'; one number for each row if units are unknown or their numbers differ.
+        # For example '0.41 m, 1.53 rad'; one number per row if units are unknown or a unit has several scales.
         sizes = [f"{size:.3g} {unit}".strip() for size, unit in zip(self.scale, self.task.units, strict=True)]
         lengths = ", ".join(dict.fromkeys(sizes) if all(self.task.units) else sizes)
         bound = f"relative singular value of the task above {self.least_singular_value:g}"
@@ -146,12 +147,12 @@ class ClearBox(Box):
 
     @property
     def condition(self) -> Self:
-        """Itself."""
+        """The domain itself, which is its own condition."""
         return self
 
     @property
     def singular_bound(self) -> Self:
-        """Itself."""
+        """The domain itself, which bounds singular values."""
         return self
 
     @property
@@ -165,7 +166,7 @@ class ClearBox(Box):
         return {"clear": self.heading}
 
     def report_condition(self) -> dict[str, Any]:
-        """Bound, rows and their sizes, and how much of the box is left."""
+        """Bound, rows and their scale, and the clear fraction of the box."""
         return {
             "least_singular_value": self.least_singular_value,
             "judged_rows": self.rows,
@@ -174,7 +175,7 @@ class ClearBox(Box):
         }
 
     def to_data(self) -> tuple[dict[str, Any], dict[str, Array]]:
-        """The bound, and the rows that count if they are not J_x: older files, which do not name them, mean J_x."""
+        """The bound and the kind of rows. Files without a kind are older and mean "x", so "x" is not written."""
         of_x = self.jacobian_function is self.task.jacobian_function
         rows = {} if of_x else {"judged_rows": self.rows}
         home = {} if self.posture is None else {"home": self.posture}
@@ -183,7 +184,7 @@ class ClearBox(Box):
 
     @classmethod
     def from_data(cls, task: Task, data: Mapping[str, Any], arrays: Mapping[str, Any]) -> Domain:
-        """The domain of a file. Its box is checked before the task is evaluated there."""
+        """Rebuild the domain from a file. The box is checked before the task is evaluated there."""
         box = Box.from_data(task, data, arrays)
         require_kind("box", box, Box)
         require_within_limits(task.robot, box)
@@ -194,11 +195,11 @@ class ClearBox(Box):
 
     @property
     def jacobian_function(self) -> ca.Function:
-        """q (n, 1) -> J (m, n), the rows that count."""
+        """q (n, 1) -> J (m, n), the rows whose singular values are bounded."""
         return self.task.jacobian_function if self.rows == "x" else self.task.frame_jacobian_function
 
     def explain(self, q: Array) -> str:
-        """What is wrong with a position (n,) that is not clear."""
+        """Say why a position (n,) is not clear."""
         return f"the task {self._describe_value(q)}"
 
     def _describe_value(self, q: Array) -> str:
@@ -206,7 +207,7 @@ class ClearBox(Box):
         return f"has a relative singular value of {self.singular_values(q):.3g}, {bound}"
 
     def apply_to(self, box: Box) -> ClearBox:
-        """The same condition on another box. A home that lies in it is kept."""
+        """The same condition on another box. The home is kept if it lies in that box."""
         kept = self.posture if self.posture is not None and Box.contains(box, self.posture) else None
         return ClearBox(box, self.task, self.least_singular_value, self.scale, self.rows, kept)
 
@@ -219,7 +220,7 @@ class ClearBox(Box):
         return inside[0] if single else inside
 
     def is_clear(self, points: Array) -> NDArray[np.bool_]:
-        """Whether s(q) > bound at points (N, n), also outside the box, (N,)."""
+        """Whether s(q) > bound at points (N, n), (N,); points may lie outside the box."""
         return np.asarray((self._batched_pivots(points)[0] > 0).all(axis=1))
 
     def singular_values(self, q: ArrayLike) -> Any:
@@ -246,10 +247,10 @@ class ClearBox(Box):
 
     @cached_property
     def pivots(self) -> ca.Function:
-        """q (n, 1) -> the pivots (m, 1) of D^-1 J J^T D^-1 - bound^2 I; all are > 0 just where q is clear."""
+        """q (n, 1) -> pivots (m, 1) of D^-1 J J^T D^-1 - bound^2 I; q is clear exactly if all of them are positive."""
         q = ca.SX.sym("q", len(self.centre))
 
-        # A product, because ** raises OverflowError for the bounds of some files.
+        # Multiply, because ** raises OverflowError for bounds in damaged files.
         square = self.least_singular_value * self.least_singular_value
         left = self.gram(q) - square * ca.SX.eye(self.task.m)
         # Pivots of Gaussian elimination without exchanges.
@@ -271,10 +272,10 @@ class ClearBox(Box):
 
 
 def default_domain(robot: Robot, task: Task) -> Box:
-    """The domain of a problem that names none: `regular_box`, or its clear part if it holds near-singular positions.
+    """The default domain of a problem: `regular_box`, or its clear part if it contains near-singular positions.
 
-    There coordinates of the whole box would fold over. The bound is 60 % of the relative singular value of the
-    centre, at most 0.2.
+    Coordinates of the whole box would fold there. The bound is 60 % of the relative singular value at the centre, and
+    at most 0.2.
 
     Args:
         robot: the robot.
@@ -291,7 +292,7 @@ def default_domain(robot: Robot, task: Task) -> Box:
             return box
         bound = min(RULES.largest_bound, RULES.centre_share * measured.singular_values(box.centre))
         return ClearBox(box, task, round(bound, 2), measured.scale)
-    # a task that is singular in the centre too, or everywhere: `check` says what is wrong
+    # The task is singular at the centre or everywhere; `check` reports this.
     except OrthocasError:
         return box
 
@@ -305,7 +306,11 @@ def exclude_singular(domain: Domain, task: Task, least_singular_value: float | N
     """
     if least_singular_value is not None:
         if not isinstance(domain, Box) or not (domain.is_box or domain.singular_bound):
-            raise InvalidValueError("least_singular_value", least_singular_value, f"none with a {domain.name}")
+            raise InvalidValueError(
+                "least_singular_value",
+                least_singular_value,
+                f"no bound, because the domain is a {domain.name}: use a Box",
+            )
         return ClearBox(domain, task, least_singular_value)
     if isinstance(domain, ClearBox) and domain.task is not task:
         return ClearBox(domain, task, domain.least_singular_value, rows=domain.rows, home=domain.posture)

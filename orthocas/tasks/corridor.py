@@ -1,4 +1,4 @@
-"""The surroundings of a path of postures: the domain of one chart for a long motion."""
+"""Neighbourhood of a path of postures, as the domain of one chart for a long motion."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ from orthocas.tools.files import find_columns, read_table
 from orthocas.tools.json import get_part
 
 CORRIDOR = "corridor"  #: name of the kind
-RADIUS = 0.2  #: of the surroundings of a path, by default [rad]
-_MOST_POSTURES = 2000  #: of a path
-_MOST_IN_FILE = 1_000_000  #: postures of a CSV file
+RADIUS = 0.2  #: default radius around a path [rad]
+_MOST_POSTURES = 2000  #: largest number of postures of a path
+_MOST_IN_FILE = 1_000_000  #: largest number of postures of a CSV file
 
 
 @register_domain
@@ -32,14 +32,14 @@ _MOST_IN_FILE = 1_000_000  #: postures of a CSV file
 class Corridor(Box):
     """All q of a box near a path of postures (ours): sum_i ((q_i - p_i) / radius_i)^2 <= 1 for a point p of the path.
 
-    The path consists of the straight lines between successive postures. A joint with an infinite radius does not count.
-    `corridor_problem` finds out which joints need not count, and builds the box.
+    The path consists of straight lines between successive postures. Joints with an infinite radius are not counted.
+    `corridor_problem` determines these joints, and builds the box.
 
-    A chart of a corridor has one xi, so it closes every loop inside that can be shrunk to a point there. Its leak grows
-    with the radius, hardly with the length of the path.
+    A chart of a corridor has one value of xi per posture. So a loop of the task gives a closed joint path if this path
+    can be shrunk to a point inside. The leak grows with the radius, and hardly with the length of the path.
 
     Args:
-        box: a box; the corridor is that part of it.
+        box: the corridor is the part of this box near the path.
         postures: the path, (N, n) [rad] or [m], numbers up to 1e6.
         radius: one number, or one for each joint (n,), from 1e-9 to 1e6 or infinite [rad] or [m].
 
@@ -64,7 +64,7 @@ class Corridor(Box):
         require_kind("box", box, Box)
         super().__init__(box.centre, box.half_width, box.unbounded)
         n = len(box.centre)
-        # Check the path, then the radius of each joint; infinite ones do not count.
+        # Check the path, then the radius of each joint.
         path = freeze_array("postures", postures, (None, n))
         if (widest := np.abs(path).max(initial=0.0)) > WIDEST:
             raise InvalidValueError("postures", f"up to {widest:.3g}", f"numbers up to {WIDEST:g}")
@@ -81,7 +81,7 @@ class Corridor(Box):
         sizes.setflags(write=False)
         for field, value in (("postures", path), ("radius", sizes)):
             object.__setattr__(self, field, value)
-        # a corridor outside the box would be empty
+        # A corridor outside the box would be empty.
         if not self.contains(path).any():
             raise InvalidValueError("postures", "outside the box", "postures of which at least one lies in the box")
 
@@ -93,12 +93,12 @@ class Corridor(Box):
 
     @property
     def condition(self) -> Self:
-        """Itself."""
+        """The domain itself, which is its own condition."""
         return self
 
     @property
     def path_bound(self) -> Self:
-        """Itself."""
+        """The domain itself, which bounds the distance to its path."""
         return self
 
     def describe_condition(self) -> dict[str, str]:
@@ -106,22 +106,22 @@ class Corridor(Box):
         return {"corridor": self.heading}
 
     def to_data(self) -> tuple[dict[str, Any], dict[str, Array]]:
-        """Path and radius, beside those of the box."""
+        """Path and radius."""
         return super().to_data()[0], {"postures": self.postures, "radius": self.radius}
 
     @classmethod
     def from_data(cls, task: Any, data: Mapping[str, Any], arrays: Mapping[str, Any]) -> Domain:
-        """The corridor of a file."""
+        """Rebuild the corridor from a file."""
         box = cast("Box", Box.from_data(task, data, arrays))
         return cls(box, *(get_part(arrays, name, np.ndarray) for name in ("postures", "radius")))
 
     def apply_to(self, box: Box) -> Self:
-        """The same condition on another box. Joints that have more room there do not count."""
+        """The same condition on another box. Joints whose half-width there is larger are not counted."""
         wider = box.half_width > self.half_width * (1 + 1e-9)
         return type(self)(box, self.postures, np.where(wider, np.inf, self.radius))
 
     def explain(self, q: Array) -> str:
-        """What is wrong with a position (n,) that is too far from the path."""
+        """Say why a position (n,) is too far from the path."""
         distance = float(np.sqrt(1 - float(self.pivots(q))))
         return f"the position is {distance:.3g} radii away from the path of the corridor, expected at most 1"
 
@@ -145,14 +145,14 @@ class Corridor(Box):
         return dense_function("pivots", [q], [1 - ca.mmin(ca.vertcat(*squares))])
 
     def draw(self, rng: np.random.Generator, count: int, power: float) -> Array:
-        """At most `count` points (M, n): uniform for power 1, nearer to the boundary for smaller powers.
+        """Draw at most `count` points (M, n): uniform for power 1, nearer to the boundary for smaller powers.
 
-        Points are drawn in cylinders around lines, in proportion to their volumes. Those in the corridor are kept with
-        probability 1 / k if k cylinders hold them.
+        Points are drawn in cylinders around the lines, in proportion to their volumes. A point of the corridor that
+        lies in k cylinders is kept with probability 1 / k.
         """
         u = rng.uniform(-1.0, 1.0, (count, len(self.centre)))
         q = self.centre + self.half_width * np.sign(u) * np.abs(u) ** power
-        # Cylinders of radius 1 around the lines, which are longer by 1 at both ends.
+        # The cylinders have radius 1 and extend the lines by 1 at both ends.
         starts, axes, squares = self.lines
         length, d = np.sqrt(squares), starts.shape[1]
         k = rng.choice(len(length), size=count, p=(length + 2) / (length + 2).sum())
@@ -162,24 +162,24 @@ class Corridor(Box):
         distance = rng.uniform(size=(count, 1)) ** (power / max(d - 1, 1)) if d > 1 else 0.0
         heights = rng.uniform(-1.0, length[k] + 1)[:, None]
         q[:, self.counted] = (starts[k] + heights * axes[k] + distance * direction) * self.radius[self.counted]
-        # Points in the corridor, those in several cylinders less often.
+        # Keep a point in k cylinders with probability 1 / k.
         q = q[self.contains(q)]
         along, across = self._parts(q)
         held = (across <= 1) & (along * length >= -1) & ((along - 1) * length <= 1)
         return np.asarray(q[rng.uniform(size=len(q)) * held.sum(axis=1) < 1])
 
     def squared_distance(self, points: Array) -> Array:
-        """Squared distance of points (N, n) from the path in radii, (N,)."""
+        """Squared distance of points (N, n) from the path, in units of the radii, (N,)."""
         along, across = self._parts(points)
         beyond = along - np.clip(along, 0.0, 1.0)
         return np.asarray((across + beyond**2 * self.lines[2]).min(axis=1))
 
     def lengths(self, steps: Array) -> Array:
-        """Lengths of steps (N, n) in radii, (N,)."""
+        """Lengths of steps (N, n) in units of the radii, (N,)."""
         return np.asarray(np.linalg.norm(steps / self.radius, axis=1))
 
     def _parts(self, points: Array) -> tuple[Array, Array]:
-        """Place of points (N, n) along every line, from 0 to 1 on it, and squared distance from it, (N, lines) each."""
+        """Position of points (N, n) along every line (0 to 1 on it), and squared distances from it, (N, lines) each."""
         starts, axes, squares = self.lines
         z = points[:, self.counted] / self.radius[self.counted]
         along = z @ axes.T - (starts * axes).sum(axis=1)
@@ -188,12 +188,12 @@ class Corridor(Box):
 
     @cached_property
     def counted(self) -> Any:
-        """The joints whose distance to the path counts, ascending."""
+        """The joints with a finite radius, ascending."""
         return np.flatnonzero(np.isfinite(self.radius))
 
     @cached_property
     def lines(self) -> tuple[Array, Array, Array]:
-        """Start, unit direction and squared length of every line, in joints that count and units of the radius."""
+        """Start, unit direction and squared length of every line, for the counted joints in units of the radius."""
         z = (self.postures / self.radius)[:, self.counted]
         starts, steps = (z[:-1], np.diff(z, axis=0)) if len(z) > 1 else (z, np.zeros_like(z))
         squares = np.maximum((steps**2).sum(axis=1), 1e-24)
@@ -201,12 +201,12 @@ class Corridor(Box):
 
 
 def read_postures(path: Path, robot: Robot) -> Array:
-    """Postures (N, n) of a CSV file: a header with the names of joints in any order, and one posture a line.
+    """Read postures (N, n) from a CSV file: a header with the joint names in any order, then one posture per line.
 
-    Columns of other names, such as those of time and velocities, are left alone.
+    Other columns, such as time and velocities, are ignored.
 
     Raises:
-        PathFileError: names the file, the line, and what is wrong there.
+        PathFileError: names the file, the line and the error.
     """
     return read_table(
         path, "postures file", "postures", _MOST_IN_FILE, lambda names: find_columns(names, robot.joint_names), least=1

@@ -38,16 +38,16 @@ if TYPE_CHECKING:
 class SamplingRules:
     """Numbers of the sampling of domains."""
 
-    most: int = 10**12  #: samples of one call
-    least_fraction: float = 1e-3  #: of the points of the box that must lie in the domain
-    tried: int = 10_000  #: points after which that counts
-    block: int = 1000  #: fewest points to draw at once, after the first ones
+    most: int = 10**12  #: largest number of samples of one call
+    least_fraction: float = 1e-3  #: smallest fraction of the box that the domain may fill
+    tried: int = 10_000  #: points to draw before this fraction is checked
+    block: int = 1000  #: smallest number of points drawn at once after the first draw
 
 
 SAMPLING = SamplingRules()
 _MOST_JOINTS = 1000
-NARROWEST = 1e-9  #: [rad] or [m]; boxes of this half-width and less drown in rounding
-WIDEST = 1e6  #: [rad] or [m]; wider boxes are mistakes, and overflow later
+NARROWEST = 1e-9  #: [rad] or [m]; narrower boxes are within rounding errors
+WIDEST = 1e6  #: [rad] or [m]; wider boxes are mistakes and overflow later
 
 
 class StopKind(Enum):
@@ -55,38 +55,41 @@ class StopKind(Enum):
 
     JOINT = "joint"  #: a joint is at the boundary of the domain, or at its limit
     NEAR_SINGULAR = "near singular"  #: the relative singular value of the task is at the bound of a `ClearBox`
-    FOLD = "fold"  #: the coordinate turns back, or would: J = dphi/dq is singular, or at the bound of a `RegularPart`
+    FOLD = "fold"  #: the coordinate reverses: J = dphi/dq is singular, or at the bound of a `RegularPart`
     CONTACT = "contact"  #: two links touch, or a link and an object of the scene
-    CONDITION = "condition"  #: another condition of the domain holds no more, such as the distance to a path
-    SINGULAR = "singular"  #: no way on: the task is singular there, or grown coordinates end
-    ENDLESS = "endless"  #: nothing: the motion returns to its start up to full turns of unbounded joints
+    CONDITION = "condition"  #: another condition of the domain ends here, such as the distance to a path
+    SINGULAR = "singular"  #: the task is singular there, or grown coordinates end, so the motion cannot continue
+    ENDLESS = "endless"  #: no end: the motion returns to its start, up to full turns of unbounded joints
 
 
 @dataclass(frozen=True, eq=False)
 class Wall:
-    """A curved boundary of a domain: what holds inside besides its box."""
+    """A curved boundary of a domain, for a condition in addition to the box."""
 
     kind: StopKind
     room: Callable[[Array], float]  #: q (n,) -> a number that is positive inside and 0 at the boundary
-    value: Callable[[Array], float] | None = None  #: q (n,) -> what is bounded, for messages; None: nothing to show
+    #: q (n,) -> the bounded quantity, for messages; None: no such quantity
+    value: Callable[[Array], float] | None = None
     heading: str = ""  #: the condition in one line
 
 
 class Domain(ABC):
-    """A region of joint space inside a box, and what it answers about itself.
+    """A region of joint space inside a box.
 
     A domain of your own derives from this class, sets `name`, `centre` and `half_width`, and defines `contains`. That
-    is enough to fit, evaluate and invert. It is saved if it defines `to_data` and `from_data` and is registered with
-    `orthocas.register_domain`; laws and trackers need a `condition`, proofs and C a `singular_bound` or a `path_bound`.
+    is enough for fit, evaluation and inverse. To be saved, it also defines `to_data` and `from_data`, and is registered
+    with `orthocas.register_domain`. Laws and trackers need a `condition`; proofs and C need a `singular_bound` or a
+    `path_bound`.
     """
 
-    name: str  #: of the kind, as files and messages have it
+    name: str  #: name of the kind, used in files and messages
     centre: Array  #: centre of the box around it, (n,)
     half_width: Array  #: half of the edge lengths of that box, (n,), > 0
-    unbounded: tuple[int, ...] = ()  #: joints whose every position lies inside
-    full_turns: bool = False  #: whether all joints turn without end and positions repeat after a turn
-    is_box: bool = False  #: whether all of the box between its boundaries lies inside
-    draws_itself: bool = False  #: whether it is a small part of its box, so that `draw` does not try the whole box
+    unbounded: tuple[int, ...] = ()  #: joints without bounds: all their positions are inside
+    full_turns: bool = False  #: whether all joints turn endlessly and positions repeat after a turn
+    is_box: bool = False  #: whether the domain is the whole box
+    #: whether `draw` draws points in the domain directly, because it is a small part of its box
+    draws_itself: bool = False
 
     @abstractmethod
     def contains(self, q: ArrayLike) -> Any:
@@ -101,34 +104,36 @@ class Domain(ABC):
 
     @property
     def home(self) -> Array:
-        """A position inside (n,) where motions, references and signs begin: the centre, unless it lies outside."""
+        """A position inside (n,) where motions and references start: the centre, unless it lies outside."""
         return self.centre
 
     @property
     def slack(self) -> Array:
-        """What the boundaries give for rounding, (n,)."""
+        """Tolerance for rounding at the boundaries, (n,)."""
         return np.asarray(1e-12 * self.half_width + 4 * np.finfo(float).eps * np.abs(self.centre))
 
     @cached_property
     def reach(self) -> Array:
-        """Largest distance from the centre that counts as inside, (n,), with slack for rounding at the boundaries."""
+        """Largest distance from the centre that counts as inside, (n,), with tolerance for rounding at boundaries."""
         lower, upper = self.bounds
         return np.asarray((upper - lower) / 2 + self.slack)
 
     @property
     def condition(self) -> Condition | None:
-        """The condition that holds in a part of the box, as an expression; None for the whole box.
+        """The condition inside the box, as an expression; None if the domain is the whole box.
 
         Raises:
-            DomainError: if the domain has a condition, but no expression of it.
+            DomainError: if the domain has a condition without an expression.
         """
         if self.is_box:
             return None
-        raise DomainError(f"a domain of kind '{self.name}' has no condition as an expression, which this needs")
+        raise DomainError(
+            f"a domain of kind '{self.name}' has no CasADi expression of its condition, which this operation needs"
+        )
 
     @property
     def known_condition(self) -> Condition | None:
-        """`condition`, or None where there is no expression of it and only `contains` answers."""
+        """The `condition`; also None if there is no expression of it, and only `contains` checks it."""
         try:
             return self.condition
         except DomainError:
@@ -136,19 +141,19 @@ class Domain(ABC):
 
     @property
     def singular_bound(self) -> SingularBound | None:
-        """The condition, if it is a bound on the singular values of a task."""
+        """The condition if it bounds the singular values of a task; otherwise None."""
         return None
 
     @property
     def path_bound(self) -> PathBound | None:
-        """The condition, if it is a bound on the distance to a path."""
+        """The condition if it bounds the distance to a path; otherwise None."""
         return None
 
     @property
     def room_to_fold(self) -> ca.Function | None:
-        """q (n, 1) -> a number (1, 1) that is positive inside, if a chart's coordinates end where it is 0.
+        """q (n, 1) -> a number (1, 1), positive inside and 0 where a chart's coordinates fold; None if there is none.
 
-        For domains that have this beside a bound on singular values; it is the last one of the pivots of `condition`.
+        Some domains have this in addition to a bound on singular values. It is the last of the pivots of `condition`.
         """
         return None
 
@@ -159,10 +164,10 @@ class Domain(ABC):
 
     @property
     def walls(self) -> tuple[Wall, ...]:
-        """What ends a motion inside the box: the conditions of the domain, each as a function that is 0 at its end.
+        """The conditions that end a motion inside the box, each as a function that is 0 at the boundary.
 
-        Ranges, self-motions, paths and messages ask a domain in this way only. Without an expression of the condition,
-        `contains` answers.
+        Ranges, self-motions, paths and messages use only these functions. For a condition without an expression, the
+        function uses `contains`.
         """
         if self.is_box:
             return ()
@@ -172,7 +177,7 @@ class Domain(ABC):
         return (Wall(StopKind.CONDITION, lambda q: float(pivots(q).full().min()), heading=condition.heading),)
 
     def require_bounds(self, what: str) -> None:
-        """Raise DomainError unless proofs and C know the form of the condition."""
+        """Raise DomainError unless proofs and C support this kind of domain."""
         if not (self.is_box or self.singular_bound or self.path_bound):
             raise DomainError(
                 f"a domain of kind '{self.name}' has no {what}, which exists for boxes, tori, and domains with a bound "
@@ -183,15 +188,15 @@ class Domain(ABC):
         """Random positions of the domain, uniform, (count, n) [rad] or [m].
 
         Raises:
-            DomainError: if next to no point of its box lies in the domain.
+            DomainError: if almost no point of the box lies in the domain.
         """
         rng = make_generator(self, count, seed)
         return keep_inside(self, count, lambda size: self.draw(rng, size, 1.0))
 
     def draw(self, rng: np.random.Generator, count: int, power: float) -> Array:
-        """At most `count` points (M, n), of which those in the domain count: |u|^power half-widths from the centre.
+        """Draw at most `count` points (M, n) at |u|^power half-widths from the centre; some may lie outside the domain.
 
-        With power 1 they are uniform, with smaller ones nearer to the boundaries.
+        They are uniform for power 1, and nearer to the boundaries for smaller powers.
         """
         u = rng.uniform(-1.0, 1.0, (count, len(self.centre)))
         points: Array = self.centre + self.half_width * (u if power == 1 else np.sign(u) * np.abs(u) ** power)
@@ -199,34 +204,34 @@ class Domain(ABC):
 
     def apply_to(self, box: Box) -> Domain:
         """The same condition on another box."""
-        raise DomainError(f"a domain of kind '{self.name}' has no other size, expected a box")
+        raise DomainError(f"a domain of kind '{self.name}' cannot be resized, expected a box")
 
     def explain(self, q: Array) -> str:
-        """What is wrong with a position (n,) of the box that lies outside the domain."""
+        """Say why a position (n,) of the box lies outside the domain."""
         return f"the position {np.round(q, 4).tolist()} lies outside the {self.name}"
 
     def describe_condition(self) -> dict[str, str]:
-        """The condition in one line, by its name."""
+        """The condition in one line, with its name as key."""
         return {}
 
     def report_condition(self) -> dict[str, Any]:
-        """What `orthocas info --json` has of the condition."""
+        """The fields of the condition in `orthocas info --json`."""
         return {}
 
     def to_data(self) -> tuple[dict[str, Any], dict[str, Array]]:
-        """Plain data and arrays for files, beside name, centre and half-width."""
+        """Plain data and arrays for files, in addition to name, centre and half-width."""
         raise DomainError(
             f"a domain of kind '{self.name}' cannot be saved, expected `to_data`, `from_data` and a registered kind"
         )
 
     @classmethod
     def from_data(cls, task: Task, data: Mapping[str, Any], arrays: Mapping[str, Any]) -> Domain:
-        """The domain from what `to_data` gave; `arrays` also has centre and half_width. They may be anything."""
+        """Rebuild the domain from `to_data`; `arrays` also has centre and half_width. The data may be damaged."""
         raise NotImplementedError
 
 
 def make_generator(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> np.random.Generator:
-    """The generator of a seed, after checks of what is asked for."""
+    """Check the arguments of a sampler, and return its random generator."""
     require_count("samples", samples, most=SAMPLING.most)
     for part in seed if isinstance(seed, tuple) else (seed,):
         require_count("seed", part, least=0)
@@ -235,15 +240,14 @@ def make_generator(domain: Domain, samples: int, seed: int | tuple[int, ...]) ->
 
 
 def keep_inside(domain: Domain, samples: int, draw: Callable[[int], Array]) -> Array:
-    """The first points of a sequence that lie in the domain, (samples, n); `draw` returns the next so many points.
+    """The first points of a sequence that lie in the domain, (samples, n); `draw(k)` returns the next k points.
 
     Raises:
-        DomainError: if next to none of them does.
+        DomainError: if almost none of them does.
     """
     kept = [np.empty((0, len(domain.centre)))]
     drawn, count, size = 0, 0, samples
     while count < samples:
-        # Give up where next to no point of the box lies in the domain.
         if drawn >= SAMPLING.tried and count < SAMPLING.least_fraction * drawn:
             raise DomainError(
                 f"{count} of {drawn} points of its box lie in the domain, expected at least "
@@ -266,7 +270,7 @@ class Condition(Protocol):
 
     @property
     def pivots(self) -> ca.Function:
-        """q (n, 1) -> numbers that are all positive just at those points of the box where the condition holds."""
+        """q (n, 1) -> numbers that are all positive exactly where the condition holds in the box."""
         ...
 
 
@@ -275,11 +279,11 @@ PathBound: TypeAlias = "Corridor"  #: a condition on the distance to a path of p
 
 
 class FoldBound(Protocol):
-    """A condition orientation * v(q) > least_volume on the volume of coordinates, as `orthocas.fit_wide` makes it."""
+    """A condition orientation * v(q) > least_volume on the volume of coordinates, as `orthocas.fit_wide` builds it."""
 
     @property
     def gradients(self) -> ca.Function:
-        """q (n, 1) -> J_xi (r, n), of any lengths."""
+        """q (n, 1) -> J_xi (r, n); its rows may have any length."""
         ...
 
     @property
@@ -298,10 +302,10 @@ _KINDS: dict[str, type[Domain]] = {}
 
 
 def register_domain(kind: type[Kind]) -> type[Kind]:
-    """Let files hold domains of a kind of your own; also a decorator. Its class attribute `name` names it there.
+    """Register a kind of domain so that files can hold it; also a decorator. Its `name` stands in files.
 
     Raises:
-        InvalidValueError: if it is no kind of domain, or its name is taken.
+        InvalidValueError: if it is not a subclass of Domain, or its name is taken.
     """
     if not (isinstance(kind, type) and issubclass(kind, Domain)):
         raise InvalidValueError("kind", repr(kind)[:80], "a class derived from orthocas.tasks.domains.Domain")
@@ -313,11 +317,11 @@ def register_domain(kind: type[Kind]) -> type[Kind]:
 
 
 def domain_from_data(name: str, task: Task, data: Mapping[str, Any], arrays: Mapping[str, Any]) -> Domain:
-    """The domain of a file.
+    """Rebuild a domain from the data of a file.
 
     Raises:
         UnknownNameError: if no registered kind has that name.
-        OrthocasError: if the data make no sense, and the errors that Python and NumPy have for damaged data.
+        OrthocasError, and errors of Python and NumPy: if the data are damaged.
     """
     require_known("domain", name, _KINDS)
     return _KINDS[name].from_data(task, data, arrays)
@@ -331,8 +335,8 @@ class Box(Domain):
     Args:
         centre: (n,) [rad] or [m].
         half_width: (n,) or one number for all joints, > 1e-9 [rad] or [m].
-        unbounded: indices of joints whose every position lies inside, such as a joint that turns without end. Samples
-            still keep within their half-width.
+        unbounded: indices of joints without bounds, such as joints that turn endlessly. Samples still stay within their
+            half-width.
 
     Example:
         >>> import orthocas as oc
@@ -352,7 +356,7 @@ class Box(Domain):
     def __init__(self, centre: ArrayLike, half_width: ArrayLike, unbounded: Sequence[int] = ()) -> None:
         middle = freeze_array("centre", centre, (None,))
         widths = as_float_array("half_width", half_width)
-        # Check both, with one half-width for all joints spread out.
+        # Check both; one half-width applies to all joints.
         if widths.ndim > 0 and widths.shape != middle.shape:
             raise ShapeError("half_width", widths.shape, middle.shape)
         widths = freeze_array("half_width", np.broadcast_to(widths, middle.shape), middle.shape)
@@ -402,8 +406,8 @@ class Box(Domain):
 
     @classmethod
     def from_data(cls, task: Task, data: Mapping[str, Any], arrays: Mapping[str, Any]) -> Domain:
-        """The box of a file."""
-        # Older files have no unbounded joints.
+        """Rebuild the box from a file."""
+        # Older files do not store unbounded joints.
         unbounded = json.get_part(data, "unbounded", list) if "unbounded" in data else ()
         centre, half_width = (json.get_part(arrays, name, np.ndarray) for name in ("centre", "half_width"))
         return Box(centre, half_width, unbounded)
@@ -438,7 +442,7 @@ class Torus(Domain):
         return _between_boundaries(self, q)
 
     def to_data(self) -> tuple[dict[str, Any], dict[str, Array]]:
-        """Nothing: a torus is known by its number of joints."""
+        """No data: the number of joints defines a torus."""
         return {}, {}
 
     @classmethod
@@ -450,14 +454,14 @@ class Torus(Domain):
 def default_box(robot: Robot, centre: ArrayLike | None = None, half_width: ArrayLike | None = None) -> Box:
     """A box inside the joint limits.
 
-    The centre is that of the limits. For a joint without both limits it is 0, or the allowed value nearest to 0.
-    Half-widths are pi/4 for revolute and 0.25 m for prismatic joints, or less where the limits are closer.
+    The centre is that of the limits, and for a joint without both limits the allowed value nearest to 0. Half-widths
+    are pi/4 for revolute and 0.25 m for prismatic joints, or less where the limits are closer.
 
     Args:
         robot: the robot.
         centre: another centre (n,).
-        half_width: another half-width (n,), or one for all joints. It is not clipped, so a `Problem` rejects a box that
-            leaves the limits.
+        half_width: another half-width (n,), or one for all joints. It is not clipped to the joint limits; a `Problem`
+            rejects a box that exceeds them.
     """
     require_kind("robot", robot, Robot)
     middle = robot.tree.centre_posture if centre is None else freeze_array("centre", centre, (robot.n,))
@@ -484,7 +488,8 @@ def require_within_limits(robot: Robot, domain: Domain) -> None:
         ShapeError: if the domain has another number of joints.
         DomainError: if the domain leaves the joint limits, or is a torus and a joint is prismatic. The message names
             the joint.
-        RobotError: if the domain is a torus and a joint mimics another one: after a turn it may be elsewhere.
+        RobotError: if the domain is a torus and a joint mimics another one, since the mimic joint may not return after
+            a turn.
     """
     if len(domain.centre) != robot.n:
         raise ShapeError("domain", (len(domain.centre),), (robot.n,))
@@ -496,7 +501,7 @@ def require_within_limits(robot: Robot, domain: Domain) -> None:
     low, high = domain.centre - domain.half_width, domain.centre + domain.half_width
     if not domain.full_turns:
         low, high = domain.bounds
-    # Limits in a URDF are decimal, so sums are not exact.
+    # URDF files hold rounded decimals, so allow rounding errors.
     slack = 1e-9 * domain.half_width
     outside = np.flatnonzero((low < robot.lower - slack) | (high > robot.upper + slack))
     if outside.size:

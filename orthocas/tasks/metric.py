@@ -23,7 +23,7 @@ from orthocas.tools.expressions import HoldsFunctions, build_expression, call_us
 METRIC_KINDS = ("euclidean", "inertia")
 MetricSpec = str | ArrayLike | Callable[[ca.SX], ca.SX]  #: what `Metric.from_spec` accepts
 _SINGULAR = 1e-12  #: eigenvalue, relative to the largest entry, that counts as zero
-_TAKES_PART = 0.1  #: share of the largest entry of an eigenvector above which a joint takes part in its motion
+_TAKES_PART = 0.1  #: a joint takes part in a motion if its entry is above this fraction of the largest one
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,17 +38,17 @@ class Metric(HoldsFunctions):
     def from_spec(cls, robot: Robot, spec: MetricSpec) -> Self:
         """Build from "euclidean", "inertia", a constant matrix (n, n), or a map q -> A(q) on SX.
 
-        `orthocas.register_metric` adds names.
+        `orthocas.register_metric` adds further names.
 
         Raises:
             UnknownNameError: if the name is unknown.
             ShapeError: if A is not (n, n).
-            MetricError: if a constant A is not symmetric positive definite, or M(q) is singular everywhere. The message
-                names the joint.
+            MetricError: if a constant A is not symmetric positive definite, or a joint without mass makes M(q) singular
+                everywhere. The message names the joint.
         """
         require_kind("robot", robot, Robot)
         q = ca.SX.sym("q", robot.n)
-        # By the name of a registered builder, or of a kind of its own.
+        # Look for a registered name, then for a built-in one.
         if isinstance(spec, str) and spec in _REGISTERED:
             built = call_user(f"metric '{spec}'", "a builder that takes this robot", _REGISTERED[spec], robot)
             return cls.custom(robot, spec, built)
@@ -58,7 +58,6 @@ class Metric(HoldsFunctions):
                 require_mass(robot, "the inertia metric")
             A = robot.function("mass_matrix")(q) if spec == "inertia" else ca.SX.eye(robot.n)
             return cls(spec, dense_function("metric", [q], [A]), {"kind": spec})
-        # By a map of q, or by a constant matrix.
         if callable(spec):
             return cls.custom(robot, "custom", spec)
         matrix = freeze_array("metric", spec, (robot.n, robot.n))
@@ -151,7 +150,7 @@ def register_metric(name: str, build: Callable[[Robot], Callable[[ca.SX], ca.SX]
     """
     require_text("name", name)
     if name in METRIC_KINDS or _REGISTERED.get(name, build) is not build:
-        raise InvalidValueError("name", repr(name), "a free name")
+        raise InvalidValueError("name", repr(name), "a name that is not taken")
     if not callable(build):
         raise InvalidValueError("build", repr(build)[:80], "a function of a robot")
     _REGISTERED[name] = build
@@ -167,7 +166,7 @@ def require_spd(matrices: Array, points: Array, advice: str = "") -> None:
         raise MetricError(
             f"metric is not finite at q = {np.round(at, 4).tolist()}, expected symmetric positive definite"
         )
-    # relative to the largest entry, since units differ
+    # Differences are relative to the largest entry, since units differ.
     asymmetry = np.abs(matrices - matrices.transpose(0, 2, 1)).max(axis=(1, 2))
     worst = int(np.argmax(asymmetry - 1e-9 * size))
     if asymmetry[worst] > 1e-9 * size[worst]:
@@ -175,25 +174,25 @@ def require_spd(matrices: Array, points: Array, advice: str = "") -> None:
             f"metric is not symmetric at q = {np.round(points[worst], 4).tolist()} "
             f"(difference {asymmetry[worst]:.3g}), expected symmetric positive definite"
         )
-    # A Cholesky factorisation is faster than eigenvalues, and enough where it succeeds.
+    # Try a Cholesky factorisation first, which is faster than eigenvalues.
     with suppress(np.linalg.LinAlgError):
         np.linalg.cholesky(matrices - _SINGULAR * size[:, None, None] * np.eye(matrices.shape[1]))
         return
-    # the eigenvalue for the message
+    # Compute the eigenvalue for the message.
     smallest = np.linalg.eigvalsh(matrices)[:, 0]
     worst = int(np.argmin(smallest - _SINGULAR * size))
     if smallest[worst] <= _SINGULAR * size[worst]:
-        # the joints that turn against each other in this motion
+        # Name the joints that take part in the motion of this eigenvalue.
         motion = np.abs(np.linalg.eigh(matrices[worst])[1][:, 0])
         joints = listed(str(k + 1) for k in np.flatnonzero(motion > _TAKES_PART * motion.max()))
         raise MetricError(
             f"metric has eigenvalue {smallest[worst]:.3g} at q = {np.round(points[worst], 4).tolist()} along a motion "
-            f"of joints {joints} (from 1), expected symmetric positive definite{advice}"
+            f"of joints {joints} (numbered from 1), expected symmetric positive definite{advice}"
         )
 
 
 def require_mass(robot: Robot, use: str) -> None:
-    """Raise MetricError, naming the joint and what its mass is needed for, if M(q) is singular at several postures."""
+    """Raise MetricError if M(q) is singular at several postures, with the massless joint and the use of the mass."""
     M = robot.mass_matrix(np.random.default_rng(0).uniform(-1, 1, (4, robot.n)))
     values, vectors = np.linalg.eigh(M)
     if np.all(values[:, 0] <= _SINGULAR * np.abs(M).max(axis=(1, 2))):

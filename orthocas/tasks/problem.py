@@ -1,4 +1,4 @@
-"""A problem: a robot, a task, a metric and a domain that fit together; and its data in files."""
+"""A problem: a robot, a task, a metric and a domain that fit together, and its file format."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ from orthocas.tools.expressions import read_tape, require_tape, wrap_shortest, w
 from orthocas.tools.json import get_part
 
 NEAR_SINGULAR = 0.01  #: smallest relative singular value of the task below which a sample counts as singular
-NEAR_HALF_A_TURN = 0.01  #: cos(angle / 2) of turns that count as half a turn: those above 178.9 deg
+NEAR_HALF_A_TURN = 0.01  #: cos(angle / 2) below which a turn counts as half a turn: above 178.9 deg
 _RANK_LOST = 1e-9
-#: fields of trees with frames, and of those with mimic joints, which other files do not have
+#: fields of trees with frames or mimic joints; files of other trees do not have them
 _OF_FRAMES = {"tips", "frame_names", "frame_parents", "frame_rotations", "frame_translations"}
 _OF_MIMICS = {"mimic_names", "mimic_kinds", "mimic_leaders", "mimic_factors", "mimic_offsets"}
-#: what reading a header that may be anything raises, beside errors of our own
+#: errors that damaged headers cause while they are read, besides errors of our own
 FOREIGN = (LookupError, TypeError, ValueError, AttributeError, ArithmeticError, RuntimeError, MemoryError)
 
 
@@ -42,18 +42,18 @@ class Problem(Shown):
         robot: the robot.
         task: a task of that robot, m < n. If it lacks a reference orientation, the one at the domain's centre is used.
         metric: "euclidean", "inertia", a constant SPD matrix (n, n), a map q -> A(q) on SX, or a Metric.
-        domain: Box or Torus inside the joint limits. Default: a box of 45 degrees about the middle of the limits,
-            or about a bent posture where the task is regular; without its near-singular positions if it has some.
-        name: for reports.
-        least_singular_value: leaves out of the domain, a Box, all positions where the relative singular value of the
-            task is smaller; see `orthocas.ClearBox`. Default: no bound.
+        domain: Box, Torus or another Domain inside the joint limits. Default: a box of 45 degrees about the centre of
+            the limits, or about a bent posture where the task is regular; near-singular positions in it are left out.
+        name: a name for reports.
+        least_singular_value: bound on the relative singular value of the task; positions of the Box below it are left
+            out of the domain, see `orthocas.ClearBox`. Default: no bound.
 
     Raises:
-        NotRedundantError: if m >= n, without the joints of a floating base.
+        NotRedundantError: if m >= n; the joints of a floating base do not count in n.
         DomainError: if the domain leaves the joint limits, or its centre is nearer to a singular position than allowed.
-        MetricError: if a constant metric is not SPD, a joint moves no mass under "inertia", or a floating base has
-            another metric. Metrics that depend on q
-            are checked by `check`, and later at every sample.
+        MetricError: if a constant metric is not SPD, a joint moves no mass under "inertia", or a robot with a floating
+            base has another metric than "inertia". Metrics that depend on q are checked by `check`, and later at every
+            sample.
 
     Example:
         >>> import orthocas as oc
@@ -79,25 +79,24 @@ class Problem(Shown):
         name: str = "custom",
         least_singular_value: float | None = None,
     ) -> None:
-        # Robot and task belong together, and the task leaves some freedom.
         require_kind("robot", robot, Robot)
         require_kind("task", task, Task)
         if not task.robot.tree.equals(robot.tree):
             raise InvalidValueError("task", f"a task of another robot ({task.name})", "a task built on the same robot")
         if task.m >= robot.n - len(robot.tree.floating):
             raise NotRedundantError(task.m, robot.n - len(robot.tree.floating))
-        # The domain lies within the limits; its centre gives a missing reference.
+        # Check the domain against the limits; its centre gives a missing reference.
         domain = default_domain(robot, task) if domain is None else domain
         if not isinstance(domain, Domain):
             raise InvalidValueError("domain", repr(domain), "a Box, a Torus or another Domain")
         require_within_limits(robot, domain)
         task = task.with_reference_at(domain.home)
         domain = exclude_singular(domain, task, least_singular_value)
-        # The metric is one of the same robot; what moves a floating base is its inertia.
+        # Check the metric against the robot. On a floating base it must be the inertia.
         metric = metric if isinstance(metric, Metric) else Metric.from_spec(robot, metric)
         require_shape("metric", metric.function.size_out(0), (robot.n, robot.n))
         if robot.tree.floating and not metric.is_inertia:
-            raise MetricError(f"metric '{metric.name}' on a floating base, expected 'inertia', which is what moves it")
+            raise MetricError(f"metric is '{metric.name}', expected 'inertia', because the base floats")
         for key, value in (
             ("robot", robot),
             ("task", task),
@@ -124,25 +123,25 @@ class Problem(Shown):
 
     @property
     def turning(self) -> tuple[int, ...]:
-        """Joints whose whole turns lead nowhere else: revolute ones that are unbounded in the domain.
+        """Joints whose full turns lead to the same posture: unbounded revolute joints.
 
-        Task, mass matrix and domain do not change with a turn of theirs, but coordinates may: a term b q_k grows by
-        2 pi b. None on a torus, where coordinates repeat as well.
+        Their turns do not change task, mass matrix and domain, but may change coordinates: a term b q_k grows by 2 pi
+        b. On a torus there are none, because coordinates repeat too.
         """
         prismatic = self.robot.tree.prismatic
         return () if self.domain.full_turns else tuple(k for k in self.domain.unbounded if not prismatic[k])
 
     def unwrap(self, q: Any, near: Any) -> Any:
-        """q - 2 pi round((q - near) / (2 pi)) for the joints that turn, q for the others.
+        """Remove full turns: q - 2 pi round((q - near) / (2 pi)) for joints in `turning`, and q for the others.
 
-        So a sensor may report angles with or without whole turns: counted from the last position, they are continuous.
+        Sensors may report angles with or without full turns; relative to the last position, they become continuous.
 
         Args:
             q: joint positions, NumPy rows (..., n), or a CasADi column (n, 1).
-            near: positions to count from, of the same kind; (n,) serves all rows.
+            near: positions near the result, of the same kind; (n,) applies to all rows.
 
         Returns:
-            As q, with |q_k - near_k| <= pi for the joints in `turning`.
+            Positions of the shape of q, with |q_k - near_k| <= pi for the joints in `turning`.
         """
         if not self.turning:
             return q
@@ -172,9 +171,9 @@ class ProblemCheck:
 
     samples: int
     singular_samples: int  #: samples with a relative singular value of the task below NEAR_SINGULAR
-    smallest_singular_value: float  #: relative one of the task, see `orthocas.ClearBox`
+    smallest_singular_value: float  #: smallest relative singular value of the task, see `orthocas.ClearBox`
     most_singular_point: tuple[float, ...]  #: joint position of the smallest singular value [rad] or [m]
-    half_turn_samples: int  #: samples where the tool is about half a turn from the reference: x ends there
+    half_turn_samples: int  #: samples where the tool is about half a turn from the reference, where x ends
 
     @property
     def half_turn_share(self) -> float:
@@ -190,8 +189,8 @@ class ProblemCheck:
 def check(problem: Problem, samples: int = 2000, seed: int = 0) -> ProblemCheck:
     """Check the metric (SPD) and the rank of the task on uniform samples of the domain.
 
-    The rank is that of the rows of `orthocas.ClearBox`: of the frame Jacobian for a task that compares orientations.
-    Rows with the same unit are first divided by their root mean square length over the domain.
+    The rank is that of the rows of `orthocas.ClearBox`: of the frame Jacobian if the task compares orientations. Rows
+    with the same unit are first divided by their root mean square length over the domain.
 
     Raises:
         MetricError: if A is not symmetric positive definite at a sample.
@@ -204,7 +203,6 @@ def check(problem: Problem, samples: int = 2000, seed: int = 0) -> ProblemCheck:
         0.0
     """
     require_kind("problem", problem, Problem)
-    # Each metric matrix is checked, then the rank of the task.
     points = sample_uniform(problem.domain, samples, seed)
     problem.metric.evaluate(points)
     smallest = relative_singular_values(problem, points)
@@ -238,7 +236,7 @@ def relative_singular_values(problem: Problem, points: Array) -> Array:
     idle = np.flatnonzero((J == 0).all(axis=(0, 2)))
     if idle.size:
         raise SingularTaskError(f"task component '{task.labels[idle[0]]}' does not depend on any joint")
-    # A domain that bounds singular values measures them itself; orientations have their frame Jacobian.
+    # A domain that bounds singular values has its own scale. Orientation tasks use the frame Jacobian.
     if domain.singular_bound is not None:
         return np.asarray(domain.singular_bound.singular_values(points))
     if task.turn is not None or task.parts:
@@ -247,7 +245,7 @@ def relative_singular_values(problem: Problem, points: Array) -> Array:
 
 
 def is_regular(problem: Problem, points: Array) -> NDArray[np.bool_]:
-    """Whether J_x is far from losing rank at points (N, n), (N,): the robot is, and the tool far from half a turn."""
+    """Whether J_x is far from losing rank at points (N, n), (N,): robot nonsingular, tool far from half a turn."""
     nonsingular = relative_singular_values(problem, points) >= NEAR_SINGULAR
     return nonsingular & (measure_half_turn_distance(problem, points) >= NEAR_HALF_A_TURN)
 
@@ -263,9 +261,9 @@ def measure_half_turn_distance(problem: Problem, points: Array) -> Array:
 
 
 def measure_task_sizes(problem: Problem) -> Array:
-    """How far the task components move over the domain, (m,): the mean of sum_j |dh_i/dq_j| half_width_j at 32 samples.
+    """Ranges of the task components over the domain, (m,): mean of sum_j |dh_i/dq_j| half_width_j at 32 samples.
 
-    1 for a component that does not move, or whose gradient is not finite.
+    The result is 1 for a component that does not move, or whose gradient is not finite.
     """
     points = sample_uniform(problem.domain, 32, 0)
     J = problem.task.batched_jacobian(points)[0].reshape(-1, problem.m, problem.n)
@@ -277,7 +275,7 @@ def write_problem(problem: Problem) -> tuple[dict[str, Any], dict[str, Stored]]:
     """Parts 'robot' and 'problem' of a header, and arrays whose names begin with robot_ and domain_."""
     tree = problem.robot.tree
     numbers = {f.name: getattr(tree, f.name) for f in fields(tree)}
-    # Without frames or mimic joints, files are as before there were any.
+    # Without frames or mimic joints, files keep the format of older versions.
     unused = (set() if tree.frame_names else _OF_FRAMES) | (set() if tree.mimic_names else _OF_MIMICS)
     numbers = {name: value for name, value in numbers.items() if name not in unused}
     arrays = {f"robot_{name}": value for name, value in numbers.items() if isinstance(value, np.ndarray)}
@@ -299,10 +297,10 @@ def write_problem(problem: Problem) -> tuple[dict[str, Any], dict[str, Stored]]:
 
 
 def read_problem(header: Mapping[str, Any], arrays: Mapping[str, Stored]) -> Problem:
-    """The problem of a header and arrays that may be anything.
+    """Rebuild a problem from a header and arrays, which may be damaged.
 
     Raises:
-        OrthocasError, and the errors that Python and NumPy have for damaged data: if they make no sense.
+        OrthocasError, and errors of Python and NumPy: if the data are damaged.
     """
     robot, data = Robot(_read_tree(get_part(header, "robot", dict), arrays)), get_part(header, "problem", dict)
     kind = get_part(data, "domain", str)
@@ -327,7 +325,7 @@ def _read_tree(data: Mapping[str, Any], arrays: Mapping[str, Stored]) -> Kinemat
     numbers: dict[str, Any] = {
         name.removeprefix("robot_"): array for name, array in arrays.items() if name.startswith("robot_")
     }
-    # Older files have no such limits.
+    # Older files do not store these limits.
     for name in ("effort_limits", "velocity_limits"):
         numbers.setdefault(name, np.full(len(names), np.inf))
     texts: dict[str, Any] = {name: tuple(value) if isinstance(value, list) else value for name, value in data.items()}
@@ -345,7 +343,7 @@ def _read_tree(data: Mapping[str, Any], arrays: Mapping[str, Stored]) -> Kinemat
 def _read_task(robot: Robot, recipe: Mapping[str, Any]) -> Task:
     if get_part(recipe, "kind", str) == "custom":
         labels = get_part(recipe, "labels", list)
-        # Older files have no units.
+        # Older files do not store units.
         units = get_part(recipe, "units", list) if "units" in recipe else ()
         require_tape(get_part(recipe, "tape", dict), robot.n)
         return Task.custom(robot, get_part(recipe, "name", str), lambda q: read_tape(recipe["tape"], q), labels, units)
@@ -357,7 +355,7 @@ def _read_task(robot: Robot, recipe: Mapping[str, Any]) -> Task:
 def _read_metric(robot: Robot, recipe: Mapping[str, Any]) -> Metric:
     if get_part(recipe, "kind", str) == "custom":
         require_tape(get_part(recipe, "tape", dict), robot.n)
-        # Older files have no name.
+        # Older files do not store a name.
         name = recipe.get("name", "custom")
         return Metric.custom(robot, name, lambda q: read_tape(recipe["tape"], q))
     return Metric.from_spec(robot, recipe["matrix"] if recipe["kind"] == "constant" else recipe["kind"])

@@ -1,4 +1,4 @@
-"""The joint range less a margin, the default domain of a task, and the posture in its middle."""
+"""The default box of a task, the default home posture, and the joint range less a margin."""
 
 from __future__ import annotations
 
@@ -22,28 +22,28 @@ from orthocas.tools.checks import Array, as_number, as_point
 class PostureRules:
     """Numbers of the choice of postures and default boxes."""
 
-    prismatic_margin: float = 0.02  #: of the range of a prismatic joint
-    regular: float = 0.04  #: regularity that keeps the centre of the limits; 5 % of the box may have less
-    samples: int = 24  #: of the box around a candidate
-    worst: int = 6  #: samples that count: the mean of the least regular ones
-    centre_samples: int = 256  #: of the box around the centre of the limits
-    farthest: float = np.pi / 2  #: [rad] from the centre of the limits
+    prismatic_margin: float = 0.02  #: fraction of the range of a prismatic joint
+    regular: float = 0.04  #: the centre of the limits is kept if at most 5 % of the box are less regular than this
+    samples: int = 24  #: samples of the box around a candidate
+    worst: int = 6  #: the score is the mean over this many least regular samples
+    centre_samples: int = 256  #: samples of the box around the centre of the limits
+    farthest: float = np.pi / 2  #: [rad], largest distance from the centre of the limits
     first_bend: float = 0.75  #: as a fraction of the range of a joint
-    penalty: float = 0.015  #: regularity that a bend of 1 rad must gain
-    rounds: int = 10  #: of moves of one joint at a time
-    regular_home: float = 0.15  #: regularity that a named posture must have
-    room: float = 0.5  #: and the fraction of the default half-widths that it must have to its joint limits
+    penalty: float = 0.015  #: a bend of 1 rad must gain this much regularity
+    rounds: int = 10  #: rounds of moves of single joints
+    regular_home: float = 0.15  #: regularity that a named posture needs
+    room: float = 0.5  #: fraction of the default half-widths that a named posture needs to its joint limits
 
 
 RULES = PostureRules()
 
 
 def regular_box(robot: Robot, task: Task) -> Box:
-    """The default box of a robot, moved to a bent posture if the task is singular in or near its centre.
+    """The default box of a robot, moved to a bent posture if the task is singular at or near its centre.
 
-    The score of a posture is the regularity of its box, less a penalty for every radian from the centre of the limits.
+    The score of a posture is the regularity of its box minus a penalty per radian from the centre of the limits.
     Candidates bend one or two joints. From the best candidate, joints move one at a time while the score improves.
-    Prismatic joints stay in the centre. The choice is deterministic.
+    Prismatic joints stay at their centre. The choice is deterministic.
 
     Args:
         robot: the robot.
@@ -69,14 +69,14 @@ class Home:
     """A posture, and where it comes from."""
 
     q: Array  #: (n,) [rad] or [m]
-    source: str  #: in words
+    source: str  #: origin in words, for messages
 
 
 def find_home(robot: Robot, task: Task, home: ArrayLike | str | None = None) -> Home:
-    """Find the posture that a user means.
+    """Find the home posture.
 
-    Without one, it is the first named posture of the robot's files around which the task is regular and joints have
-    room to move. If there is none, it is the bent posture with the best score of `orthocas.tasks.regular_box`.
+    If none is given, it is the first named posture of the robot's files around which the task is regular and the joints
+    have room to move. If there is none, it is the bent posture with the best score of `orthocas.tasks.regular_box`.
 
     Args:
         robot: the robot.
@@ -98,7 +98,7 @@ def find_home(robot: Robot, task: Task, home: ArrayLike | str | None = None) -> 
             if has_room and score.evaluate(q[None])[0] >= RULES.regular_home:
                 return Home(q, f"posture '{name}' of the robot's files")
         return Home(find_bent_posture(score, robot, box), "bent posture where the task is most regular")
-    # A posture that is given must lie inside the limits.
+    # A given posture must lie inside the limits.
     source = f"posture '{home}' of the robot's files" if isinstance(home, str) else "as given"
     q = robot.home(home) if isinstance(home, str) else as_point("home", home, robot.n)
     outside = np.flatnonzero((q <= robot.lower) | (q >= robot.upper))
@@ -112,9 +112,9 @@ def find_home(robot: Robot, task: Task, home: ArrayLike | str | None = None) -> 
 
 
 def find_joint_range(robot: Robot, margin_deg: float) -> Box:
-    """The box of all joint positions farther than a margin from the limits. Endless joints have a full turn.
+    """The box of all joint positions farther than a margin from the limits. Endless joints get a full turn.
 
-    It is within the limits, and the one around 0 if that is.
+    The turn lies within the limits, and is centred at 0 if possible.
 
     Raises:
         DomainError: if a joint has no range left.
@@ -122,7 +122,7 @@ def find_joint_range(robot: Robot, margin_deg: float) -> Box:
     margin = np.radians(as_number("margin_deg", margin_deg))
     if not 0 <= margin < np.pi:
         raise InvalidValueError("margin_deg", margin_deg, "an angle from 0 to below 180 degrees")
-    # Joints without limits take the room of a default box; endless ones a full turn.
+    # A sliding joint without limits gets the width of a default box, an endless joint a full turn.
     prismatic = np.array(robot.tree.prismatic)
     missing = np.isinf(robot.lower) | np.isinf(robot.upper)
     middle = robot.tree.centre_posture
@@ -131,7 +131,7 @@ def find_joint_range(robot: Robot, margin_deg: float) -> Box:
     room = np.where(prismatic, RULES.prismatic_margin * (high - low), margin) * ~missing
     low, high = low + room, high - room
     endless = ~prismatic & (missing | (robot.upper - robot.lower >= 2 * np.pi))
-    # the turn around 0, or the one within the limits that is nearest to it
+    # The full turn around 0, or the nearest one within the limits.
     turn = np.clip(0.0, robot.lower + np.pi, robot.upper - np.pi)
     low, high = np.where(endless, turn - np.pi, low), np.where(endless, turn + np.pi, high)
     empty = np.flatnonzero(low >= high)
@@ -147,10 +147,10 @@ def find_joint_range(robot: Robot, margin_deg: float) -> Box:
 
 
 def find_bent_posture(score: PostureScore, robot: Robot, box: Box) -> Array:
-    """The posture with the best score, (n,), found from the centre of the default box."""
+    """The posture with the best score, (n,), searched from the centre of the default box."""
     room = np.minimum(box.centre - robot.lower, robot.upper - box.centre) - box.half_width
     way = np.where(robot.tree.prismatic, 0.0, np.clip(room, 0.0, RULES.farthest))
-    # Begin with no joint, one joint or two joints bent, in both directions.
+    # Start from candidates with no, one or two bent joints, in both directions.
     single = [sign * RULES.first_bend * row for row in np.diag(way)[way > 0] for sign in (-1, 1)]
     double = [a + b for a, b in combinations(single, 2) if not (a * b).any()]
     best, value = score.find_best(np.array([np.zeros(len(way)), *single, *double]))
@@ -170,7 +170,7 @@ def find_bent_posture(score: PostureScore, robot: Robot, box: Box) -> Array:
 
 @dataclass(frozen=True)
 class PostureScore:
-    """Scores postures: how regular a task is on the default boxes around them."""
+    """Scores a posture by the regularity of a task on the default box around it."""
 
     robot: Robot
     m: int
@@ -192,12 +192,12 @@ class PostureScore:
         Rows of J_x are scaled to order one, and N is an orthonormal basis of the self-motions at the centre. The value
         is zero where the task is singular, and where coordinates along the self-motions of the centre fold over.
         """
-        # The same points of a box around each centre, the centre itself first.
+        # Use the same points for each box; the centre comes first.
         n = self.robot.n
         unit = np.vstack([np.zeros(n), sample_evenly(Box(np.zeros(n), 1.0), samples, 0)])
         points = centres[:, None] + default_half_width(self.robot, centres)[:, None] * unit
         at = np.broadcast_to(centres[:, None], points.shape)
-        # J over its sizes, completed by the null space at the centre: a square matrix, regular where J turns little.
+        # Append the null space at the centre to the scaled J. The square matrix is regular where J turns little.
         J = _fill_singular(self.jacobian(points.reshape(-1, n), at.reshape(-1, n))[0])
         J = J.reshape(*points.shape[:2], self.m, n) / self.scale[:, None]
         rest = np.linalg.svd(J[:, 0])[2][:, None, self.m :]
@@ -205,7 +205,7 @@ class PostureScore:
         return np.asarray(np.linalg.svd(stacked, compute_uv=False)[..., -1])
 
     def evaluate(self, centres: Array) -> Array:
-        """Mean of the smallest regularities on the boxes around centres (N, n), (N,)."""
+        """Means over the least regular samples of the boxes around centres (N, n), (N,)."""
         values = np.sort(self.evaluate_regularity(centres, RULES.samples - 1), axis=1)
         return np.asarray(values[:, : RULES.worst].mean(axis=1))
 
@@ -217,5 +217,5 @@ class PostureScore:
 
 
 def _fill_singular(J: Array) -> Array:
-    """J with zeros, that is singular, where it is not finite."""
+    """J with zeros where it is not finite, so that it counts as singular."""
     return np.where(np.isfinite(J), J, 0.0)

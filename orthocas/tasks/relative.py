@@ -1,4 +1,4 @@
-"""Task values relative to a target, so that whole orientations have no end half a turn from a reference."""
+"""Errors and rates of task values relative to a target, without a discontinuity half a turn from the reference."""
 
 from typing import Any
 
@@ -16,11 +16,11 @@ from orthocas.tools.columns import BlockedFunction
 class Relative:
     """A task value x relative to a target x_d.
 
-    For most tasks that is e = x - x_d. For orientation and pose tasks, with the tip's orientation R and its target
-    R_d, the rows of the orientation are 2 sin(angle / 2) axis of R_d^T R, so they do not depend on the reference of the
-    task; with an AXIS they are put into its order: tilt, tilt, turn. The error is continuous except where R is half a
-    turn from R_d. The rates are J(q) dq with d(e)/dt = J dq at e = 0: those rows are the angular
-    velocity in the tip's axes.
+    For most tasks, the error is e = x - x_d. For orientation and pose tasks, let R be the tip's orientation and R_d the
+    target orientation. The orientation rows of e are 2 sin(angle / 2) axis of R_d^T R, so they do not depend on the
+    reference of the task. With an AXIS, these rows are put into its order: tilt, tilt, turn. The error is continuous
+    except where R is half a turn from R_d. J(q) are the rates of the error: d(e)/dt = J dq at e = 0, so its orientation
+    rows are the angular velocity in the tip's axes.
 
     Args:
         task: the task.
@@ -30,18 +30,18 @@ class Relative:
         self.task = task
         turn = task.turn
         self.turned = turn is not None and turn.whole  #: whether x holds a whole orientation
-        self.first = task.m - 3 if self.turned else task.m  #: rows before those of the orientation
+        self.first = task.m - 3 if self.turned else task.m  #: number of rows before those of the orientation
 
     @property
     def turns(self) -> tuple[int, int]:
-        """First row, and the one after the last, of a rotation vector or a tilt; equal: there is none."""
+        """First row and end row of the rotation vector or tilt in x; both are equal if there is none."""
         turn = self.task.turn
         if turn is None or not turn.whole:
             return 0, 0
         return self.first, self.first + (3 if turn.axis is None else 2)
 
     def difference(self, x_d: Any, x: Any) -> Any:
-        """-e: how far x_d is from x, as NumPy rows (..., m) or CasADi columns (m, 1)."""
+        """-e, the step from x to x_d, as NumPy rows (..., m) or CasADi columns (m, 1)."""
         if not self.turned:
             return x_d - x
         if isinstance(x, ca.SX | ca.MX | ca.DM) or isinstance(x_d, ca.SX | ca.MX | ca.DM):
@@ -61,10 +61,10 @@ class Relative:
         return BlockedFunction(self.rates) if self.turned else self.task.batched_jacobian
 
     def embed(self, x: Array) -> Array:
-        """Orientations of x (N, m) as numbers (N, 16) whose distance is that of the error for near ones, and no seam.
+        """Map orientations of x (N, m) to vectors (N, 16) without a seam, whose distances approximate small errors.
 
-        They are the products of the entries of the unit quaternion, which stands for a rotation with either sign, times
-        the root of 2. For tasks of a whole orientation only.
+        The entries are products of two entries of the unit quaternion, times sqrt(2), so that both signs of a
+        quaternion give the same vector. For tasks of a whole orientation only.
         """
         p = self._batched_quaternion(x)[0]
         return np.asarray(np.sqrt(2) * (p[:, :, None] * p[:, None]).reshape(len(p), -1))
@@ -74,7 +74,7 @@ class Relative:
         return Batched(self.task.quaternion_function)
 
     def error(self, q: ca.MX, x_d: ca.MX) -> tuple[ca.MX, ca.MX]:
-        """The error e (m, 1), and de/dq (m, n) for x_d at rest."""
+        """The error e (m, 1), and de/dq (m, n) while x_d is at rest."""
         J = self.rates(q)
         if not self.turned:
             return self.task.function(q) - x_d, J
@@ -82,11 +82,11 @@ class Relative:
         return e, slope @ J
 
     def compute_drift(self, q: ca.MX, x_d: ca.MX, dx_d: ca.MX) -> ca.MX:
-        """-de/dt of an arm at rest, (m, 1): the rate that de/dq dq must have to stay at the target."""
+        """-de/dt of an arm at rest, (m, 1): the value of (de/dq) dq that follows the moving target."""
         return -self._drift(self.task.function(q), x_d, dx_d) if self.turned else dx_d
 
     def compute_bias(self, q: ca.MX, dq: ca.MX, w: ca.MX, target: tuple[ca.MX, ca.MX, ca.MX]) -> ca.MX:
-        """(d/dt) (de/dq w - drift) for a constant w (n, 1), (m, 1), with x_d and its two derivatives."""
+        """d/dt (de/dq w - drift) for constant w (n, 1), (m, 1); `target` holds x_d and its two derivatives."""
         bend = self.task.rates_derivative_function(q, dq, w)
         if not self.turned:
             return bend - target[2]
@@ -95,30 +95,30 @@ class Relative:
 
     @cached_property
     def moved(self) -> ca.Function:
-        """x, e, x_d, dx_d, ddx_d -> the value at e from x, in the sense of the error, and the derivatives it has there.
+        """x, e, x_d, dx_d, ddx_d -> x moved by an error e, and its two derivatives.
 
-        They are those of an orientation with the angular velocity and acceleration of x_d in its own axes. For tasks of
-        a whole orientation only.
+        The derivatives are those of an orientation with the angular velocity and acceleration of x_d in its own axes.
+        For tasks of a whole orientation only.
         """
         x, e, x_d, dx_d, ddx_d = symbols = self._make_symbols("x", "e", "x_d", "dx_d", "ddx_d")
         return dense_function("moved", symbols, list(self.turned_by(x, e, *self._turning(x_d, dx_d, ddx_d))))
 
     @cached_property
     def turned_by(self) -> ca.Function:
-        """x, e, rates, their derivatives -> the value at e from x, and its derivatives. Rates are those of the error.
+        """x, e, rates, changes -> x moved by an error e, and its derivatives, from rates of e and their changes.
 
         For tasks of a whole orientation only.
         """
         x, e, rates, changes = symbols = self._make_symbols("x", "e", "rates", "changes")
         turn, first = self.task.turn, self.first
         assert turn is not None
-        # The error as a quaternion step, and how the product turns.
+        # Write the error as a quaternion step, and differentiate the product.
         half, omega, alpha = (self._order.T @ part[first:] for part in (e / 2, rates, changes))
         step = ca.vertcat(ca.sqrt(ca.fmax(1 - ca.sumsqr(half), 0)), half)
         p = multiply_quaternions(self._compute_quaternion(x), step)
         dp = multiply_quaternions(p, ca.vertcat(0, omega)) / 2
         ddp = (multiply_quaternions(dp, ca.vertcat(0, omega)) + multiply_quaternions(p, ca.vertcat(0, alpha))) / 2
-        # The components of the product, and their derivatives along it.
+        # Components of the product, and their derivatives.
         at = ca.SX.sym("p", 4)
         value = turn.of_quaternion(at)
         rate = ca.jtimes(value, at, dp)
@@ -129,7 +129,7 @@ class Relative:
         return dense_function("turned_by", symbols, [ca.cse(part) for part in whole])
 
     def convert_rates(self, x_d: ca.MX, dx_d: ca.MX, ddx_d: ca.MX) -> tuple[ca.MX, ca.MX]:
-        """Rates of a target value as the error counts, (m, 1), about its own axes, and their derivatives."""
+        """Convert rates of a target value to rates of the error (m, 1), about the target's axes, and derivatives."""
         if not self.turned:
             return dx_d, ddx_d
         rate, change = self._turning(x_d, dx_d, ddx_d)
@@ -149,7 +149,7 @@ class Relative:
 
     @cached_property
     def _error(self) -> ca.Function:
-        """x, x_d -> e, and the slope E with de/dq = E J."""
+        """x, x_d -> e, and the matrix E with de/dq = E J."""
         x, x_d = self._make_symbols("x", "x_d")
         w, v = self._compute_turn(x, self._compute_quaternion(x_d))
         slope = ca.SX.eye(self.task.m)
@@ -168,16 +168,16 @@ class Relative:
 
     @cached_property
     def _bend(self) -> ca.Function:
-        """x, x_d, dx_d, ddx_d, rates of dq, rates of w, dJ/dt w -> d/dt (E J w + de/dt of an arm at rest)."""
+        """x, x_d, dx_d, ddx_d, J dq, J w, dJ/dt w -> d/dt (E J w + de/dt of an arm at rest)."""
         names = ("x", "x_d", "dx_d", "ddx_d", "here", "there", "change")
         x, x_d, dx_d, ddx_d, here, there, change = symbols = self._make_symbols(*names)
-        # The rotation from the target, and its rates: w, v are a unit quaternion.
+        # Rotation from the target as a unit quaternion (w, v), and its rates.
         p, omega, alpha = self._differentiate_target(x_d, dx_d, ddx_d)
         w, v = self._compute_turn(x, p)
         turning, along, changing = (self._order.T @ rate[self.first :] for rate in (here, there, change))
         dv = (w * (turning - omega) + ca.cross(v, turning + omega)) / 2
         dw = -ca.dot(v, turning - omega) / 2
-        # The rate of E times the velocity, and that of what the moving target adds.
+        # Rate of E times the velocity, and rate of the term that the moving target adds.
         moved = dw * along + ca.cross(dv, along) + w * changing + ca.cross(v, changing)
         left = dw * omega + w * alpha - ca.cross(dv, omega) - ca.cross(v, alpha)
         straight = change[: self.first] - ddx_d[: self.first]
@@ -196,7 +196,7 @@ class Relative:
         return quaternion
 
     def _compute_turn(self, x: ca.SX, target: ca.SX) -> tuple[ca.SX, ca.SX]:
-        """w >= 0 and v of the rotation from the target orientation to that of x."""
+        """Quaternion (w, v), w >= 0, of the rotation from the target orientation to the orientation of x."""
         turn = multiply_quaternions(conjugate(target), self._compute_quaternion(x))
         turn = turn * ca.if_else(turn[0] < 0, -1, 1)
         return turn[0], turn[1:]

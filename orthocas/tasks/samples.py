@@ -1,4 +1,4 @@
-"""Samples: seeded points of a domain, and the data of the loss there that do not depend on the coordinates."""
+"""Samples: random points of a domain with a seed, and the data of the loss that do not depend on the coordinates."""
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -16,12 +16,12 @@ from orthocas.tools.checks import Array
 if TYPE_CHECKING:
     from orthocas.tasks.problem import Problem
 
-#: of the largest entry of J_x: columns below are of joints that do not move the task. Robot files round angles to nine
-#: decimals and more, and such a joint then tilts the axis that it turns about by so little
+#: Relative to the largest entry of J_x. A joint with a smaller column does not move the task. Robot files round angles
+#: to about nine decimals, which tilts the axes of such joints by this order of magnitude.
 NEGLIGIBLE = 1e-8
 
 
-POWERS = (1.0, 0.5, 0.25)  #: of the distance from the centre: uniform, near faces, near corners
+POWERS = (1.0, 0.5, 0.25)  #: exponents of the distance from the centre: uniform, near faces, near corners
 
 
 def sample_uniform(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> Array:
@@ -30,9 +30,10 @@ def sample_uniform(domain: Domain, samples: int, seed: int | tuple[int, ...]) ->
 
 
 def sample_boundary_weighted(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> Array:
-    """Draw points of which a third is uniform, a third near faces and a third near corners, (samples, n).
+    """Draw points: one third uniform, one third near faces, and one third near corners, (samples, n).
 
-    Charts fail there first. The distances from the centre are |u|^p half-widths, with uniform u and p = 1, 1/2 and 1/4.
+    Charts fail near boundaries first. Distances from the centre are |u|^p half-widths, with uniform u and p = 1, 1/2,
+    1/4.
 
     Source:
         ours.
@@ -49,9 +50,9 @@ def sample_boundary_weighted(domain: Domain, samples: int, seed: int | tuple[int
 def sample_evenly(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> Array:
     """Draw points that fill the domain more evenly than random points, (samples, n).
 
-    They follow the additive recurrence frac(shift + k alpha), alpha_j = g^-j, with g the root of g^(n+1) = g + 1 and a
-    random shift. Each point is uniformly distributed, and every part of the sequence is even. Means over the domain
-    converge faster than with independent points. Domains that draw points themselves get independent ones.
+    They follow the additive recurrence frac(shift + k alpha) with a random shift, alpha_j = g^-j, and the root g of
+    g^(n+1) = g + 1. Each point is uniformly distributed, and every part of the sequence is even, so means over the
+    domain converge faster than with independent points. Domains with their own sampler get independent points.
 
     Source:
         M. Roberts, docs/reference/references.md [R2018]. The use for training is ours.
@@ -59,7 +60,7 @@ def sample_evenly(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> 
     if domain.draws_itself:
         return sample_uniform(domain, samples, seed)
     rng, n = make_generator(domain, samples, seed), len(domain.centre)
-    # The generalised golden ratio, by fixed-point iteration.
+    # Find the generalised golden ratio by fixed-point iteration.
     g = 1.5
     for _ in range(64):
         g = (1 + g) ** (1 / (n + 1))
@@ -77,7 +78,7 @@ def sample_evenly(domain: Domain, samples: int, seed: int | tuple[int, ...]) -> 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Samples:
-    """N joint positions with their task gradients and metrics. Samples with a vanishing gradient are left out."""
+    """N joint positions with task gradients and metrics. Positions where a task gradient vanishes are left out."""
 
     points: Array  #: q, (N, n)
     task_jacobian: Array  #: J_x, (N, m, n)
@@ -95,16 +96,16 @@ class Samples:
         return Samples(self.points[part], self.task_jacobian[part], inverse)
 
     def restricted_to(self, joints: list[int]) -> "Samples":
-        """The samples of some joints only. The metric must not couple them to the others."""
+        """The samples restricted to some joints. The metric must not couple these to the others."""
         inverse = None if self.metric_inverse is None else self.metric_inverse[:, joints][:, :, joints]
         return Samples(self.points[:, joints], self.task_jacobian[:, :, joints], inverse)
 
     def project_to_zero_momentum(self, base: Sequence[int]) -> "Samples":
-        """The samples as velocities with zero momentum see them, on a base that floats.
+        """The samples of a robot with a floating base, for velocities with zero momentum.
 
-        For A = M, with the joints a of the arms: J_x becomes the generalised Jacobian J_a - J_b M_bb^-1 M_ba, which is
-        (J_x M^-1)_a ((M^-1)_aa)^-1, and M the generalised inertia, whose inverse is (M^-1)_aa. Then the base's joints
-        neither move the task nor are coupled to the others, and count as idle.
+        For A = M, let a be the joints of the arms and b those of the base. J_x becomes the generalised Jacobian J_a -
+        J_b M_bb^-1 M_ba = (J_x M^-1)_a ((M^-1)_aa)^-1, and M becomes the generalised inertia, whose inverse is
+        (M^-1)_aa. Then the base's joints neither move the task nor couple to the others, so they count as idle.
 
         Source:
             [UY1989]; the metric is ours.
@@ -135,10 +136,10 @@ class Samples:
         """An A-orthonormal basis e_1..e_m of span{grad_A h_i}, (N, m, n)."""
         gradients = self.compute_metric_gradients(self.task_jacobian)
         gram = gradients @ self.task_jacobian.transpose(0, 2, 1)
-        # Rows are normalised first, so that units do not matter.
+        # Normalise rows first, so that units do not matter.
         scale = np.sqrt(np.einsum("sii->si", gram))
         gram = gram / scale[:, :, None] / scale[:, None, :]
-        # The least eigenvalue keeps singular samples finite.
+        # A lower bound on the eigenvalues keeps singular samples finite.
         values, vectors = np.linalg.eigh(gram)
         values = np.maximum(values, 1e-14)
         whitening = (vectors / np.sqrt(values)[:, None, :]).transpose(0, 2, 1)
@@ -158,7 +159,7 @@ class Samples:
         return Z
 
     def orientation(self, coordinate_jacobians: Array) -> float:
-        """Sign (+1 or -1), at most of the samples, of the volume that J_xi (N, r, n) spans across the task."""
+        """Sign (+1 or -1) of the volume that J_xi (N, r, n) spans across the task, at most of the samples."""
         return 1.0 if np.median(np.linalg.det(coordinate_jacobians @ self.null_basis)) >= 0 else -1.0
 
     def collect_data(self, names: Iterable[str], orientation: float | None) -> list[Array]:
@@ -166,8 +167,8 @@ class Samples:
 
         Args:
             names: see `orthocas.fitting.terms.SAMPLE_DATA`.
-            orientation: result of `orientation` for the coordinates that a fit starts from. The null basis is oriented
-                like them, so that the volume of their gradients is positive.
+            orientation: result of `orientation` for the initial coordinates of a fit. The null basis gets the same
+                orientation, so that the volume of their gradients is positive.
         """
         data: dict[str, Array] = {name: getattr(self, name) for name in names}
         if "null_basis" in data:
@@ -177,7 +178,7 @@ class Samples:
         return list(data.values())
 
 
-Draw = Callable[[int, tuple[int, ...]], Samples]  #: draws a number of fresh samples of a problem, with a seed
+Draw = Callable[[int, tuple[int, ...]], Samples]  #: number and seed -> fresh samples of a problem
 
 
 def split_samples(samples: Samples, count: int) -> Iterator[Samples]:
@@ -194,7 +195,7 @@ def sample_problem(problem: "Problem", samples: int, seed: int | tuple[int, ...]
 
 def evaluate_samples(problem: "Problem", points: Array) -> Samples:
     """Samples at given joint positions (N, n)."""
-    # Samples where a task gradient vanishes are left out.
+    # Leave out samples where a task gradient vanishes.
     J = problem.task.evaluate_jacobian(points)
     kept = np.all(np.einsum("sij,sij->si", J, J) > 0, axis=1)
     if not kept.all():
@@ -207,18 +208,18 @@ def evaluate_samples(problem: "Problem", points: Array) -> Samples:
 
 
 def find_idle_joints(problem: "Problem", samples: Samples) -> list[int]:
-    """Joints k on which the task does not depend, and which the metric does not couple to the others.
+    """Find joints on which the task does not depend, and which the metric does not couple to the others.
 
-    At every sample column k of J_x vanishes, up to `NEGLIGIBLE`, row k of A^-1 is zero off the diagonal, and A does not
-    depend on q_k. Then J_x A^-1 e_k = 0, so xi = q_k is exact and orthogonal to every coordinate of the other joints.
-    The rest of the problem does not depend on joint k. So are the joints of a floating base in
-    `Samples.project_to_zero_momentum`: the generalised inertia does not depend on where it is.
+    At every sample, column k of J_x vanishes (up to `NEGLIGIBLE`), row k of A^-1 is zero off the diagonal, and A does
+    not depend on q_k. Then J_x A^-1 e_k = 0, so xi = q_k is exact and orthogonal to every coordinate of the other
+    joints, and the rest of the problem does not depend on joint k. The joints of a floating base are idle after
+    `Samples.project_to_zero_momentum`, because the generalised inertia does not depend on the pose of the base.
     """
-    # Joints that no component of the task depends on.
+    # Find joints that no component of the task depends on.
     J = samples.task_jacobian
     size = np.abs(J).max(axis=(0, 1))
     idle = size <= NEGLIGIBLE * size.max()
-    # Those that the metric couples with others, or that change it, are not idle.
+    # Exclude joints that the metric couples to others or depends on.
     if samples.metric_inverse is not None:
         B = np.abs(samples.metric_inverse).max(axis=0)
         off_diagonal = (B - np.diag(B.diagonal())).max(axis=1)
@@ -229,12 +230,12 @@ def find_idle_joints(problem: "Problem", samples: Samples) -> list[int]:
 
 
 def compute_row_scale(J: Array, units: tuple[str, ...]) -> Array:
-    """Root mean square length of the rows of each unit, (m,). It does not depend on how axes are turned; 1 if zero.
+    """Root mean square length of the rows of each unit, (m,), independent of the directions of axes; 1 if it is zero.
 
     Args:
         J: task Jacobians at samples, (N, m, n).
-        units: units of the task components; rows with the same unit share one scale, rows of unknown unit have their
-            own.
+        units: units of the task components; rows with the same unit share one scale, and each row of unknown unit has
+            its own.
     """
     squares = (J**2).sum(axis=2).mean(axis=0)
     groups = np.array([unit or f"own {i}" for i, unit in enumerate(units)])
@@ -243,25 +244,25 @@ def compute_row_scale(J: Array, units: tuple[str, ...]) -> Array:
 
 
 def compute_directions(problem: "Problem", joints: Sequence[int], points: Array) -> Array:
-    """Compute what a symmetry of the joints keeps: A^-1, and the projector on the task gradients.
+    """Compute the matrices that a symmetry of the joints preserves: A^-1, and the projector on the task gradients.
 
     The second index of the projector is raised by the metric.
 
     Args:
-        problem: robot, task, metric; the other joints stay at the centre of its domain.
-        joints: the k joints.
-        points: their positions, (N, k).
+        problem: robot, task and metric; all other joints stay at the home of its domain.
+        joints: indices of the k joints.
+        points: positions of these joints, (N, k).
 
     Returns:
-        Both matrices over the largest entry of the pair, (N, 2, k, k); NaN everywhere if a gradient vanishes at any.
+        Both matrices, each divided by its largest entry, (N, 2, k, k); NaN everywhere if a gradient vanishes at any
+        point.
     """
-    # Joints that are not given stay at the centre.
     q = np.repeat(problem.domain.home[None], len(points), axis=0)
     q[:, list(joints)] = points
     samples = evaluate_samples(problem, q).restricted_to(list(joints))
     if len(samples) < len(points):
         return np.full((len(points), 2, len(joints), len(joints)), np.nan)
-    # A^-1 and the projector on the task's span, each over its largest entry.
+    # Compute A^-1 and the projector on the span of the task gradients, each over its largest entry.
     basis = samples.task_basis
     projector = basis.transpose(0, 2, 1) @ basis
     inverse = samples.metric_inverse

@@ -55,24 +55,24 @@ _RELATIVE = "relative_"
 
 @dataclass(frozen=True)
 class Frames:
-    """The frame that a task looks at, and the one in which it is described."""
+    """The frame that a task observes, and its frame of reference."""
 
     frame: str | None = None  #: None: the tip
     relative_to: str | None = None  #: None: the world
 
     @classmethod
     def from_recipe(cls, recipe: Mapping[str, Any]) -> Self:
-        """Frames of a task's recipe."""
+        """Rebuild the frames of a task's recipe."""
         return cls(recipe.get("frame"), recipe.get("relative_to"))
 
     @property
     def recipe(self) -> dict[str, str]:
-        """What is not the default."""
+        """The names that are not the default."""
         return {name: value for name, value in vars(self).items() if value is not None}
 
     @property
     def suffix(self) -> str:
-        """What the name of a task adds."""
+        """The frames as a suffix of the task's name."""
         frame = "" if self.frame is None else f" of {self.frame}"
         return frame if self.relative_to is None else f"{frame} in {self.relative_to}"
 
@@ -103,7 +103,7 @@ class Task(Shown, HoldsFunctions):
     units: tuple[str, ...]  #: units of the components: "m", "rad", or "" if unknown
     function: ca.Function  #: q (n, 1) -> x (m, 1), dense, SX
     recipe: dict[str, Any]  #: plain data that `from_recipe` turns into the same task
-    parts: tuple[Task, ...] = ()  #: of a stack of tasks
+    parts: tuple[Task, ...] = ()  #: the tasks of a stack
 
     @classmethod
     def position(
@@ -115,7 +115,7 @@ class Task(Shown, HoldsFunctions):
             robot: the robot.
             axes: different letters of "xyz".
             frame: name of a frame of the robot, here and in other tasks; default: the (first) tip.
-            relative_to: name of the frame in which position and orientation are described; default: the world.
+            relative_to: name of the frame of reference for position and orientation; default: the world.
 
         Example:
             >>> import orthocas as oc
@@ -131,7 +131,7 @@ class Task(Shown, HoldsFunctions):
 
     @classmethod
     def polar(cls, robot: Robot) -> Self:
-        """Radius [m] and angle [rad] of the tip in the x-y plane: axes="xy" in polar coordinates."""
+        """Radius [m] and angle [rad] of the tip in the x-y plane."""
         return cls._build_of_pose(
             robot,
             "polar",
@@ -152,13 +152,13 @@ class Task(Shown, HoldsFunctions):
         """Orientation of the tip relative to a reference, (3,): a rotation vector, or tilt and turn of an axis.
 
         By default x = 2 sin(angle / 2) axis of the rotation from the reference to the tip. Near the reference, it is
-        the rotation vector [rad]. Half a turn away from the reference it jumps to its opposite; solvers, laws and C
-        compare orientations by the turn between them, so they pass there (`orthocas.tasks.relative`).
+        the rotation vector [rad]. Half a turn away from the reference it jumps to its opposite. Solvers, laws and C use
+        the rotation between two orientations as the error, so they move through this point (`orthocas.tasks.relative`).
 
-        With `axis`, the first two components are those of the task `axis`, and the third is the tip's turn about that
-        axis in (-pi, pi] [rad], after the shortest rotation that tilts the axis. A last joint along the axis then moves
-        the third component only, by its own angle. This suits flanges with little inertia about their axis. x is smooth
-        unless the axis tilts by half a turn; the turn jumps at half a turn.
+        With `axis`, the first two components are those of the task `axis`. The third is the tip's turn about that axis
+        in (-pi, pi] [rad], after the shortest rotation that tilts the axis. If the last joint lies along the axis, it
+        moves the third component only, by its own angle. This suits flanges with little inertia about their axis. The
+        tilt is smooth unless the axis tilts by half a turn, and the turn jumps at half a turn.
 
         Args:
             robot: the robot.
@@ -198,10 +198,10 @@ class Task(Shown, HoldsFunctions):
     ) -> Self:
         """Direction of one axis of the tip, (2,). It does not depend on the rotation about that axis.
 
-        Let d be the axis, expressed in a frame whose own axis is the reference direction. Then
-        x = (d_i, d_j) sqrt(2 / (1 + d_axis)) has the length 2 sin(angle / 2), where angle lies between axis and
-        reference. Near the reference, x is in [rad]. It is smooth except half a turn away. The frame is that of the tip
-        at the centre of the problem's domain, or some frame about the given direction.
+        Let d be the axis of the tip, expressed in a frame whose own axis is the reference direction. Then x = (d_i,
+        d_j) sqrt(2 / (1 + d_axis)) has the length 2 sin(angle / 2), with the angle between axis and reference. Near the
+        reference, x is in [rad]. It is smooth except half a turn away. By default this frame is that of the tip at the
+        centre of the problem's domain; with a given direction it is any frame with that axis.
 
         Args:
             robot: the robot.
@@ -247,7 +247,7 @@ class Task(Shown, HoldsFunctions):
     def relative_pose(
         cls, robot: Robot, base: str, frame: str, reference: ArrayLike | None = None, axis: str | None = None
     ) -> Self:
-        """Pose of one frame in another, (6,): what two hands that hold one object keep; see `pose`.
+        """Pose of one frame in another, (6,), such as the relative pose of two hands that hold one object; see `pose`.
 
         Args:
             robot: the robot.
@@ -260,7 +260,7 @@ class Task(Shown, HoldsFunctions):
 
     @classmethod
     def centre_of_mass(cls, robot: Robot, axes: str = "xyz") -> Self:
-        """Centre of mass of all that the joints move, along the given world axes [m]."""
+        """Centre of mass of everything that the joints move, along the given world axes [m]."""
         require_kind("robot", robot, Robot)
         rows = _find_rows(axes)
         q, name = ca.SX.sym("q", robot.n), f"centre_of_mass:{axes}"
@@ -269,10 +269,10 @@ class Task(Shown, HoldsFunctions):
 
     @classmethod
     def pointing(cls, robot: Robot, camera: str, target: ArrayLike | str, axis: str = "z") -> Self:
-        """How far an axis of a camera points away from a target, (2,), 0 where it looks at it.
+        """Deviation of a camera's axis from the direction of a target, (2,); 0 if the camera points at the target.
 
-        Let u be the unit vector from the camera to the target, in the camera's frame. Then
-        x = (u_i, u_j) sqrt(2 / (1 + u_axis)) has the length 2 sin(angle / 2), where angle lies between axis and u.
+        Let u be the unit vector from the camera to the target, in the camera's frame. Then x = (u_i, u_j) sqrt(2 / (1 +
+        u_axis)) has the length 2 sin(angle / 2), with the angle between axis and u.
 
         Args:
             robot: the robot.
@@ -289,7 +289,7 @@ class Task(Shown, HoldsFunctions):
         q, k = ca.SX.sym("q", robot.n), "xyz".index(axis)
         place = target if isinstance(target, str) else freeze_array("target", target, (3,)).tolist()
         to = robot.frame_position(q, place) if isinstance(place, str) else ca.SX(place)
-        # The unit vector to the target in the axes of the camera, flattened by Lambert's map.
+        # Unit vector to the target in the axes of the camera, mapped by Lambert's projection.
         u = robot.frame_rotation(q, camera).T @ (to - robot.frame_position(q, camera))
         u /= ca.norm_2(u)
         others = [i for i in range(3) if i != k]
@@ -300,16 +300,16 @@ class Task(Shown, HoldsFunctions):
 
     @classmethod
     def stack(cls, *tasks: Task) -> Self:
-        """Several tasks of one robot as one, such as the positions of two hands.
+        """Combine several tasks of one robot into one, such as the positions of two hands.
 
-        Labels that appear twice get a number. The components are compared as numbers: those of an orientation end half
-        a turn from their reference.
+        Labels that appear twice get a number. Components are compared as plain numbers, so those of an orientation jump
+        half a turn from their reference.
 
         Args:
             tasks: the tasks, in the order of the components.
 
         Raises:
-            InvalidValueError: if there is none, or they are of different robots.
+            InvalidValueError: if there is no task, or the tasks belong to different robots.
 
         Example:
             >>> import orthocas as oc
@@ -324,7 +324,7 @@ class Task(Shown, HoldsFunctions):
                 raise InvalidValueError("tasks", "of different robots", "tasks of one robot")
         if not tasks:
             raise InvalidValueError("tasks", "none", "at least one")
-        # A stack of stacks is one stack.
+        # Flatten stacks of stacks.
         tasks = tuple(single for task in tasks for single in task.parts or (task,))
         labels = [label for task in tasks for label in task.labels]
         numbered = (
@@ -368,14 +368,13 @@ class Task(Shown, HoldsFunctions):
         """
         require_kind("robot", robot, Robot)
         require_text("name of a task", str(name))
-        # the expression, as one column
         q = ca.SX.sym("q", robot.n)
         x = build_expression(f"task '{name}'", function, q)
         if x.shape[1] != 1 or x.shape[0] == 0:
             raise ShapeError(f"task '{name}'", x.shape, (None, 1))
         require_kind("labels", labels, Sequence)
         require_kind("units", units, Sequence)
-        # Names and units are free, but printable and one for each component.
+        # Labels and units are free, but must be printable and one per component.
         labels = tuple(str(label) for label in labels) or tuple(f"{name}[{i}]" for i in range(x.shape[0]))
         units = tuple(str(unit) for unit in units) or ("",) * x.shape[0]
         for argument, texts in (("labels", labels), ("units", units)):
@@ -390,8 +389,8 @@ class Task(Shown, HoldsFunctions):
     def named(cls, robot: Robot, kind: str, q_reference: ArrayLike | None = None) -> Task:
         """A task by its short name: position, position:xy, polar, orientation, pose, pose:z, axis:x, position+axis.
 
-        Of a robot with two tips also relative_position and relative_pose, of the second tip in the first.
-        `orthocas.register_task` adds names.
+        A robot with two tips also has relative_position and relative_pose, of the second tip in the first.
+        `orthocas.register_task` adds further names.
 
         Args:
             robot: the robot.
@@ -400,18 +399,18 @@ class Task(Shown, HoldsFunctions):
         """
         require_kind("kind", kind, str)
         frames, base_kind = _OF_TIP, kind
-        # of the second tip in the first one
+        # Second tip relative to the first one.
         if kind.startswith(_RELATIVE):
             if len(robot.tips) != 2:
                 raise InvalidValueError("task", kind, f"a robot with two tips; this one has {listed(robot.tips)}")
             base_kind, frames = kind.removeprefix(_RELATIVE), Frames(robot.tips[1], robot.tips[0])
-        # kinds that orthocas knows
+        # Built-in kinds.
         if (turn := TipTurn.from_kind(base_kind)) is not None:
             reference = None if q_reference is None else frames.evaluate_rotation(robot, q_reference)
             return cls._build_turned(robot, turn, reference, frames)
         if base_kind.partition(":")[0] == "position":
             return cls.position(robot, base_kind.partition(":")[2] or "xyz", frames.frame, frames.relative_to)
-        # Kinds that users have registered.
+        # Registered kinds.
         name, _, words = kind.partition(":")
         if name not in _REGISTERED or (name == "polar" and words):
             raise UnknownNameError("task", kind, list_task_kinds())
@@ -422,7 +421,7 @@ class Task(Shown, HoldsFunctions):
 
     @classmethod
     def from_recipe(cls, robot: Robot, recipe: Mapping[str, Any]) -> Task:
-        """The task of a robot that `recipe` describes. Custom tasks and stacks have no such recipe."""
+        """Rebuild the task of a robot from a recipe. Custom tasks and stacks cannot be rebuilt from theirs."""
         kind, frames = recipe["kind"], Frames.from_recipe(recipe)
         if kind == "pointing":
             return cls.pointing(robot, recipe["camera"], recipe["target"], recipe["axis"])
@@ -434,24 +433,24 @@ class Task(Shown, HoldsFunctions):
 
     @property
     def of_tip(self) -> bool:
-        """Whether the task is a function of the pose of the (first) tip in the world, of a kind that is known."""
+        """Whether the task is of a built-in kind and depends only on the pose of the (first) tip in the world."""
         kind = self.recipe["kind"]
         of_pose = TipTurn.from_kind(kind) is not None or kind == "polar" or kind.startswith("position:")
         return of_pose and Frames.from_recipe(self.recipe) == _OF_TIP
 
     @property
     def lacks_reference(self) -> bool:
-        """Whether the task compares the tip's orientation with a reference that was not given."""
+        """Whether the task compares the tip's orientation with a reference, but none was given."""
         own = self.turn is not None and "reference" not in self.recipe
         return own or any(part.lacks_reference for part in self.parts)
 
     @property
     def turn(self) -> TipTurn | None:
-        """How the task compares the tip's orientation with a reference; None if it does not."""
+        """The comparison of the tip's orientation with a reference; None if the task has none."""
         return TipTurn.from_kind(self.recipe["kind"])
 
     def with_reference_at(self, q: ArrayLike) -> Task:
-        """The task with the tip's orientation at q (n,) as its reference, or the task itself if it has one already."""
+        """The task with the tip's orientation at q (n,) as its reference; the task itself if it has one already."""
         if not self.lacks_reference:
             return self
         if self.parts:
@@ -465,7 +464,7 @@ class Task(Shown, HoldsFunctions):
         return len(self.labels)
 
     def __call__(self, q: Any) -> Any:
-        """Task values x = h(q): (m,) of one joint position (n,), (N, m) of (N, n), an expression of a CasADi column."""
+        """Task values x = h(q): (n,) -> (m,), (N, n) -> (N, m), and a CasADi column -> an expression."""
         if isinstance(q, ca.SX | ca.MX):
             require_shape("q", q.shape, (self.robot.n, 1))
             return self.function(q)
@@ -481,8 +480,8 @@ class Task(Shown, HoldsFunctions):
     def jacobian_function(self) -> ca.Function:
         """q (n, 1) -> J_x = dh/dq (m, n), by automatic differentiation.
 
-        For a rotation vector x = 2 v of the unit quaternion (w, v), dx/dt = w omega + v x omega with the angular
-        velocity omega in the tip's axes, which also holds next to half a turn.
+        For a rotation vector x = 2 v with the unit quaternion (w, v), dx/dt = w omega + v x omega, with the angular
+        velocity omega in the tip's axes. This also holds near half a turn.
         """
         if self.parts:
             return _stack_functions(self.parts, "jacobian_function")
@@ -495,10 +494,10 @@ class Task(Shown, HoldsFunctions):
 
     @cached_property
     def rates_function(self) -> ca.Function:
-        """q (n, 1) -> rows (m, n): dq gives how fast x moves, as seen from where it is; J_x for most tasks.
+        """q (n, 1) -> rows (m, n) whose product with dq is the rate of the error of `Relative`; J_x for most tasks.
 
-        For orientation and pose tasks, the rows of the orientation are the angular velocity in the tip's axes; with an
-        AXIS in the order tilt, tilt, turn. They are those of J_x where the tip has the reference orientation.
+        For orientation and pose tasks, the orientation rows are the angular velocity in the tip's axes; with an AXIS in
+        the order tilt, tilt, turn. They equal those of J_x where the tip has the reference orientation.
         """
         turn = self.turn
         if turn is None or not turn.whole:
@@ -518,26 +517,26 @@ class Task(Shown, HoldsFunctions):
 
     @cached_property
     def frame_jacobian_function(self) -> ca.Function:
-        """q (n, 1) -> rows (m, n) whose singular values measure how near a singular position is, in any x.
+        """q (n, 1) -> rows (m, n) whose singular values measure the distance to singular positions, in any x.
 
         For orientation, pose and axis tasks they are the velocity [m/s] and the angular velocity [rad/s] of the tip in
-        its own axes, per unit joint velocity: rows of the geometric Jacobian, of which an axis task takes the two
-        across its axis. J_x loses rank half a turn from the reference, where x ends; these rows do not. For other tasks
-        they are J_x itself.
+        its own axes, per unit joint velocity: rows of the geometric Jacobian. An axis task takes the two angular rows
+        across its axis. These rows keep their rank half a turn from the reference, where x ends and J_x loses rank. For
+        other tasks they are J_x itself.
 
-        A stack has the rows of its parts. If it has the pose of a frame, and that of a second frame in the first, then
-        what the first one moves of the second is a combination of its own rows, and is left out: the rows are those of
-        both poses in the world, to which such a stack is equivalent.
+        A stack has the rows of its parts. Suppose a stack has the pose of one frame in the world and the pose of a
+        second frame in the first. It is equivalent to both poses in the world, so it takes the rows of these: the
+        motion of the second frame due to the first one is a linear combination of the first one's rows.
         """
         if self.turn is None and not self.parts:
             return self.jacobian_function
         q = ca.SX.sym("q", self.robot.n)
-        # Parts that repeat what another one says take the rows of their own frames.
+        # Parts that depend on other parts take the rows of their own frames.
         rows = [part._build_frame_rows(q, frames) for part, frames in _find_independent_frames(self.parts or (self,))]
         return dense_function("frame_jacobian", [q], [ca.cse(ca.vertcat(*rows))])
 
     def _build_frame_rows(self, q: ca.SX, frames: Frames) -> ca.SX:
-        """The rows at q of a task with one part, if it looked at these frames; positions stay in their own axes."""
+        """The rows of a task with one part for given frames at q; positions stay in their own axes."""
         turn = self.turn
         if turn is None and frames == self._frames:
             return self.jacobian_function(q)
@@ -552,7 +551,7 @@ class Task(Shown, HoldsFunctions):
         """q, v, w (n, 1) -> d^2 h(q)[v, w] = (d/ds) J_x(q + s v) w, (m, 1)."""
         q, v, w = (ca.SX.sym(name, self.robot.n) for name in ("q", "v", "w"))
         if self._has_rotation_vector:
-            # d^2 x = d(w omega + v x omega), with the change of the quaternion along v.
+            # d^2 x = d(w omega + v x omega) includes the change of the quaternion along v.
             J, p, change = self.rates_function(q), self._build_quaternion(q), self.rates_derivative_function(q, v, w)
             along, there = (J[self.m - 3 :, :] @ rate for rate in (v, w))
             dp = multiply_quaternions(p, ca.vertcat(0, along)) / 2
@@ -565,7 +564,7 @@ class Task(Shown, HoldsFunctions):
 
     @cached_property
     def centred_jacobian_function(self) -> ca.Function:
-        """q, centre (n, 1) -> J_x at q (m, n). A missing reference is taken at the centre."""
+        """q, centre (n, 1) -> J_x at q (m, n), with a missing reference taken at `centre`."""
         q, centre = (ca.SX.sym(name, self.robot.n) for name in ("q", "centre"))
         x, turn = self.smooth_function(q), self.turn
         if turn is not None and self.lacks_reference:
@@ -592,8 +591,8 @@ class Task(Shown, HoldsFunctions):
     def manipulability(self, q: ArrayLike) -> Array:
         """w = sqrt(det(J J^T)) at q (n,), or at each row of (N, n); 0 at singular positions.
 
-        J is `frame_jacobian_function`: of a pose, the geometric Jacobian. Units are mixed for poses, so w compares
-        postures of one robot and task.
+        J is `frame_jacobian_function`, for a pose the geometric Jacobian. The units of a pose are mixed, so compare w
+        between postures of one robot and task only.
 
         Raises:
             ShapeError, InvalidValueError: if q has another number of joints, or is not finite.
@@ -623,7 +622,7 @@ class Task(Shown, HoldsFunctions):
         """q (n, 1) -> w (1, 1): the volume that the rows of `frame_jacobian_function` span."""
         q = ca.SX.sym("q", self.robot.n)
         J, volume, units = self.frame_jacobian_function(q), ca.SX(1), list[ca.SX]()
-        # the product of the lengths that rows have across those before them; a length of 0 has no direction
+        # Multiply the lengths of the parts of each row across the rows before it. A zero length has no direction.
         for k in range(J.shape[0]):
             across = J[k, :].T
             for unit in units:
@@ -656,7 +655,7 @@ class Task(Shown, HoldsFunctions):
         return J
 
     def value(self, position: ArrayLike | None, orientation: ArrayLike) -> Array:
-        """The task value x, (m,) or (N, m), of a pose of the tip, for tasks of a whole orientation.
+        """The task value x, (m,) or (N, m), at a pose of the tip, for tasks of a whole orientation.
 
         Args:
             position: of the tip [m], (3,) or (N, 3); None for tasks without one.
@@ -664,7 +663,7 @@ class Task(Shown, HoldsFunctions):
                 (w, x, y, z), (4,) or (N, 4).
 
         Raises:
-            InvalidValueError, ShapeError: if the task has no whole orientation, or for arguments that do not fit.
+            InvalidValueError, ShapeError: if the task has no whole orientation, or the arguments do not fit it.
 
         Example:
             >>> import orthocas as oc
@@ -674,10 +673,10 @@ class Task(Shown, HoldsFunctions):
             [0.5, 0.0, 0.4, 2.0, 0.0, 0.0]
         """
         turn = self._require_whole_turn()
-        # The rotation from the reference, as the components of x.
+        # Components of the rotation from the reference.
         R, single = _read_rotations("orientation", orientation)
         turned = Batched(self.components_function)(self.reference.T @ R)[0]
-        # A pose has a position, too; an orientation has none.
+        # A pose also has a position.
         if turn.with_position:
             p = as_float_array("position", np.nan if position is None else position)
             require_shape("position", p.shape, (3,) if single else (len(R), 3))
@@ -688,16 +687,17 @@ class Task(Shown, HoldsFunctions):
         return np.asarray(turned[0] if single else turned)
 
     def target(self, pose: Any) -> Array:
-        """The task value x, (m,) or (N, m), of a target as people hold it.
+        """The task value x, (m,) or (N, m), of a target in any usual form.
 
         Args:
-            pose: a pose or many of them: matrices (4, 4) or (N, 4, 4); an object with `translation` and `rotation`,
-                such as `pinocchio.SE3`, or a list of such; a pair of position and orientation as in `value`, or a list
-                of pairs. Rotations may be rounded to single precision or three decimals. Or task values (m,) or
-                (N, m), which come back as they are; a rotation matrix is not taken for three of them.
+            pose: one pose or many: matrices (4, 4) or (N, 4, 4); an object with `translation` and `rotation`, such as
+                `pinocchio.SE3`, or a list of them; a pair of position and orientation as in `value`, or a list of pairs.
+                Rotations may be rounded to single precision or four decimals. Or task values (m,) or (N, m), which are
+                returned unchanged. A rotation matrix is refused, so that it is not mistaken for three task values.
 
         Raises:
-            InvalidValueError, ShapeError: if the pose has no meaning for the task, or is none.
+            InvalidValueError, ShapeError: if the argument has none of these forms, or the task does not use such a
+                pose.
 
         Example:
             >>> import numpy as np
@@ -716,7 +716,7 @@ class Task(Shown, HoldsFunctions):
         pairs = isinstance(pose, list) and all(isinstance(row, tuple) and len(row) == 2 for row in rows)
         if pairs and all(np.ndim(row[0]) == 1 for row in rows):
             pose = tuple(np.array([as_float_array("target", row[k]) for row in pose]) for k in (0, 1))
-        # Two task values have one shape, position and orientation have two.
+        # Task values are one array; position and orientation are a pair of different shapes.
         if isinstance(pose, tuple) and len(pose) == 2:
             position, orientation = (as_float_array("target", part) for part in pose)
             if position.ndim > 1 or position.shape != orientation.shape:
@@ -726,9 +726,11 @@ class Task(Shown, HoldsFunctions):
             if np.abs(values[..., 3, :] - [0.0, 0.0, 0.0, 1.0]).max(initial=0.0) > 1e-9:
                 raise InvalidValueError("target", values[..., 3, :].tolist(), "matrices with the last row (0, 0, 0, 1)")
             return self._value_of(values[..., :3, 3], values[..., :3, :3])
-        # Three rotation vectors are hardly ever a rotation matrix; whoever gives one means the orientation.
+        # A rotation matrix here is most likely meant as an orientation, not as three rotation vectors.
         if values.shape == (3, 3) and self.turn is not None and np.abs(values @ values.T - np.eye(3)).max() < 1e-6:
-            raise InvalidValueError("target", values.tolist(), "task.value(None, R) of a rotation matrix R, or a pose")
+            raise InvalidValueError(
+                "target", values.tolist(), "task values or a pose; for a rotation matrix R use task.value(None, R)"
+            )
         return values
 
     def _value_of(self, position: Array, orientation: Array) -> Array:
@@ -747,13 +749,13 @@ class Task(Shown, HoldsFunctions):
 
     @cached_property
     def quaternion_function(self) -> ca.Function:
-        """x (m, 1) -> the rotation (w, x, y, z) from the reference to the tip, for tasks of a whole orientation."""
+        """x (m, 1) -> quaternion (w, x, y, z) of the rotation from the reference to the tip, for whole orientations."""
         x = ca.SX.sym("x", self.m)
         return dense_function("quaternion", [x], [self._require_whole_turn().quaternion(x[self.m - 3 :])], ["x"])
 
     @cached_property
     def components_function(self) -> ca.Function:
-        """The rotation from the reference to the tip (3, 3) -> the components of the orientation (3, 1)."""
+        """Rotation from the reference to the tip (3, 3) -> components of the orientation (3, 1)."""
         R = ca.SX.sym("R", 3, 3)
         return dense_function("components", [R], [self._require_whole_turn().components(R, ca.SX.zeros(3))[-3:]], ["R"])
 
@@ -762,7 +764,7 @@ class Task(Shown, HoldsFunctions):
         return self.turn is not None and self.turn.whole and self.turn.axis is None
 
     def _build_quaternion(self, q: ca.SX) -> ca.SX:
-        """The rotation from the reference to the tip, (4, 1)."""
+        """Quaternion of the rotation from the reference to the tip, (4, 1)."""
         return find_quaternion(ca.SX(ca.DM(self.reference.T)) @ self._build_frame("rotation")(q))
 
     @property
@@ -770,7 +772,7 @@ class Task(Shown, HoldsFunctions):
         return Frames.from_recipe(self.recipe)
 
     def _build_frame(self, quantity: FrameQuantity) -> ca.Function:
-        """q (n, 1) -> position, rotation or geometric Jacobian of the frame that the task looks at."""
+        """q (n, 1) -> position, rotation or geometric Jacobian of the frame that the task observes."""
         return self._frames.build_function(self.robot, quantity)
 
     def _require_whole_turn(self) -> TipTurn:
@@ -780,10 +782,10 @@ class Task(Shown, HoldsFunctions):
 
     @property
     def reference(self) -> Array:
-        """The reference orientation (3, 3) of a task that has one: as given, or the tip's in mid-range.
+        """The reference orientation (3, 3): the given one, or the tip's orientation at the centre of the joint limits.
 
         Raises:
-            InvalidValueError: if the task has no orientation.
+            InvalidValueError: if the task compares no orientation.
         """
         if self.turn is None:
             raise InvalidValueError("task", self.name, "one with an orientation")
@@ -793,13 +795,13 @@ class Task(Shown, HoldsFunctions):
 
     @cached_property
     def smooth_function(self) -> ca.Function:
-        """q (n, 1) -> x (m, 1) in the form to differentiate: without cases, but with few digits next to half a turn."""
+        """q (n, 1) -> x (m, 1) for differentiation: without case distinctions, but inaccurate near half a turn."""
         turn = self.turn
         if self.parts:
             return _stack_functions(self.parts, "smooth_function")
         if turn is None:
             return self.function
-        # Components of an orientation without the seam half a turn from the reference.
+        # Orientation components by the formula without case distinctions.
         q = ca.SX.sym("q", self.robot.n)
         rotation, position = self._build_frame("rotation")(q), self._build_frame("position")(q)
         x = turn.components(ca.SX(ca.DM(self.reference.T)) @ rotation, position, True)
@@ -807,7 +809,7 @@ class Task(Shown, HoldsFunctions):
 
     @classmethod
     def _build_turned(cls, robot: Robot, turn: TipTurn, reference: ArrayLike | None, frames: Frames = _OF_TIP) -> Self:
-        """A task of a frame's rotation from a reference (3, 3), or from the default if it is None."""
+        """A task of a frame's rotation relative to a reference (3, 3), or to the default one if it is None."""
         require_kind("robot", robot, Robot)
         if reference is None:
             base, extra = frames.evaluate_rotation(robot, robot.tree.centre_posture), {}
@@ -839,10 +841,10 @@ class Task(Shown, HoldsFunctions):
 
 
 def _find_rows(axes: str) -> list[int]:
-    """Places of different letters of "xyz".
+    """Indices of different letters of "xyz".
 
     Raises:
-        InvalidValueError: if they are no such letters.
+        InvalidValueError: if the argument is anything else.
     """
     require_kind("axes", axes, str)
     if not axes or len(set(axes)) != len(axes) or set(axes) - set("xyz"):
@@ -851,18 +853,18 @@ def _find_rows(axes: str) -> list[int]:
 
 
 def _stack_functions(tasks: Sequence[Task], name: str) -> ca.Function:
-    """Functions of q (n, 1) that each task has, one below the other."""
+    """Stack a function of q (n, 1) that each task has."""
     q = ca.SX.sym("q", tasks[0].robot.n)
     return dense_function("h", [q], [ca.vertcat(*(getattr(task, name)(q) for task in tasks))])
 
 
 def _find_independent_frames(tasks: Sequence[Task]) -> list[tuple[Task, Frames]]:
-    """Each task with the frames whose rows stand for its own beside those of the others.
+    """Choose for each task the frames whose rows to use next to those of the other tasks.
 
-    A whole pose that leads from a frame with a known pose to another one is as good as the pose of the latter in the
-    world. What is seen from a frame with a known pose is as good as what the world sees of it.
+    If a task gives the whole pose of one frame relative to another, and the pose of one of them is known, then the pose
+    of the other in the world is known too. The same holds for observations from a frame with a known pose.
     """
-    # A pose with one known end settles its other end, until no more follow.
+    # Mark the second frame of a pose as known once its first one is, until nothing changes.
     stands: dict[int, Frames] = {}
     settled: set[str | None] = {None}  #: frames with a known pose; None: the world
     poses = [task for task in tasks if task.turn is not None and task.turn.whole and task.turn.with_position]
@@ -873,21 +875,20 @@ def _find_independent_frames(tasks: Sequence[Task]) -> list[tuple[Task, Frames]]
             if len(new) == 1:
                 stands[id(task)] = Frames(new[0])
                 settled.add(new[0])
-    # All else is seen from a known frame as from the world.
+    # Observations from a known frame are equivalent to observations from the world.
     seen = {id(task): Frames(task._frames.frame) for task in tasks if task._frames.relative_to in settled}
     return [(task, stands.get(id(task), seen.get(id(task), task._frames))) for task in tasks]
 
 
 def _read_rotations(name: str, value: ArrayLike) -> tuple[Array, bool]:
-    """Rotation matrices (N, 3, 3) from such, or from unit quaternions, and whether it was one."""
-    # One rotation or several, as matrices or quaternions.
+    """Rotation matrices (N, 3, 3) from matrices or unit quaternions, and whether there was only one."""
     values = as_float_array(name, value)
     require_finite(name, values)
     single = values.shape in ((4,), (3, 3))
     if not single and values.shape[1:] not in ((4,), (3, 3)):
         raise InvalidValueError(f"shape of {name}", values.shape, "(3, 3), (N, 3, 3), (4,) or (N, 4)")
     rows = values[None] if single else values
-    # Quaternions of length 1, but for rounding, which is taken out.
+    # Quaternions must have length 1 up to rounding, and are normalised.
     if rows.ndim == 2:
         off = np.abs(np.linalg.norm(rows, axis=1) - 1)
         if len(rows) and off.max() > 1e-6:
@@ -903,7 +904,7 @@ _REGISTERED: dict[str, Callable[[Robot, str], Task]] = {
 
 
 def list_task_kinds() -> tuple[str, ...]:
-    """The short names of tasks, those of `register_task` too."""
+    """The short names of tasks, including those of `register_task`."""
     return tuple(dict.fromkeys((*TASK_KINDS, *_REGISTERED)))
 
 
@@ -912,7 +913,7 @@ def register_task(name: str, build: Callable[[Robot, str], Task]) -> None:
 
     Args:
         name: a short name without a colon.
-        build: makes the task from a robot and what follows the colon in "name:words", which may be "".
+        build: makes the task from a robot and the text after the colon in "name:text", "" without a colon.
 
     Raises:
         InvalidValueError: if the name has a colon or is taken.

@@ -28,15 +28,16 @@ from orthocas.tools.json import read_strict_json
 
 @dataclass(frozen=True, slots=True)
 class ArchiveRules:
-    """Bounds of archives, so that no file fills the memory."""
+    """Bounds of archives, so that no file can fill the memory."""
 
-    axes: int = 32  #: of an array
+    axes: int = 32  #: largest number of axes of an array
     small: int = 2**23  #: bytes that any file may unpack to
-    ratio: int = 100  #: numbers in use hardly shrink; whoever packs zeros could fill the memory
+    #: largest ratio of unpacked to packed size: real numbers hardly shrink, but zeros could fill the memory
+    ratio: int = 100
     entries: int = 10_000
-    last_character: int = 0x10FFFF  #: of Unicode
-    surrogates: int = 0xD800 >> 11  #: first bits of halves of characters, which cannot be written
-    encrypted: int = 1  #: flag bit of an entry
+    last_character: int = 0x10FFFF  #: last code point of Unicode
+    surrogates: int = 0xD800 >> 11  #: first bits of surrogate halves, which are not valid characters
+    encrypted: int = 1  #: flag bit of an encrypted entry
 
 
 RULES = ArchiveRules()
@@ -45,7 +46,7 @@ _NPY_HEADER = re.compile(
     rb"\{'descr': '([<>|][biuf][1248]|[<>]U\d{1,8})', 'fortran_order': (True|False), "
     rb"'shape': \(((?:\d{1,18}, ?)*(?:\d{1,18})?)\), \} *\n"
 )
-#: what zipfile raises on damaged files
+#: errors that zipfile raises on damaged files
 _DAMAGE = (
     *(zipfile.BadZipFile, zlib.error, lzma.LZMAError, struct.error, EOFError, OSError, RuntimeError, MemoryError),
     *(NotImplementedError, LookupError, TypeError, ValueError, OverflowError, AttributeError),
@@ -73,15 +74,15 @@ class Kind:
 def write_archive(
     path: str | Path, kind: Kind, header: Mapping[str, Any], arrays: Mapping[str, Stored], force: bool = False
 ) -> None:
-    """Write header and arrays to a file that appears whole or not at all.
+    """Write header and arrays to a file that appears complete or not at all.
 
     Raises:
-        ArchiveError: if the folder is missing or not writable, the header holds NaN or infinity, or there is another
-            kind of file (unless `force`) or a symbolic link. The error is `kind.error`.
+        ArchiveError: if the folder is missing or not writable, the header holds NaN or infinity, or the path is a
+            symbolic link or (without `force`) a file of another kind. The class of the error is `kind.error`.
     """
     target = Path(path)
     require_free(target, kind, force)
-    # The header lists the checksum of every array, and has one of its own.
+    # The header lists the checksums of all arrays, and has a checksum of its own.
     entries = {f"{name}.npy": write_npy(array) for name, array in arrays.items()}
     full = {
         "format": kind.format,
@@ -95,7 +96,7 @@ def write_archive(
         raise kind.error(f"cannot write {target}: its header would hold NaN or infinity") from None
     entries = {_HEADER: text, _DIGEST: _compute_digest(text).encode(), **entries}
     try:
-        # The file is written beside its place, and moved there whole.
+        # Write a draft, and move it into place when it is complete.
         with (
             publish(target.parent) as drafts,
             zipfile.ZipFile(drafts / target.name, "w", zipfile.ZIP_DEFLATED) as draft,
@@ -107,25 +108,25 @@ def write_archive(
 
 
 def require_free(path: Path, kind: Kind, force: bool) -> None:
-    """Check early, before long work, that a file can be written and replaces none but one of its kind.
+    """Check, before long work, that a file can be written, and would replace only a file of its kind.
 
     Raises:
-        ArchiveError: the kind's own, if it cannot, or would.
+        ArchiveError: otherwise; the class of the error is `kind.error`.
     """
     require_writable(path, kind.error)
     require_replaceable(path, is_archive(path, kind.format), force, kind.error)
 
 
 def read_archive(path: str | Path, kind: Kind) -> tuple[dict[str, Any], dict[str, Stored]]:
-    """Read header and arrays back; entries that the header does not list are left alone.
+    """Read header and arrays; entries that the header does not list are ignored.
 
     Raises:
-        ArchiveError: if the file is missing, truncated, edited, of another format, or from a newer version. The error
-            is `kind.error`.
+        ArchiveError: if the file is missing, truncated, edited, of another format, or from a newer version. The class
+            of the error is `kind.error`.
     """
     source = Path(path)
     with open_archive(source, kind.name, kind.error) as zipped:
-        # Nothing is believed before format, version and checksum are right.
+        # Check format, version and checksum before anything is used.
         text = zipped.read(_HEADER)
         header = _check_header(source, kind, text)
         if (
@@ -133,7 +134,7 @@ def read_archive(path: str | Path, kind: Kind) -> tuple[dict[str, Any], dict[str
             or zipped.read(_DIGEST) != _compute_digest(text).encode()
         ):
             raise kind.error(f"{source} has been edited: its header does not match its checksum")
-        # Each entry must match its checksum, too.
+        # Check the checksum of each entry too.
         zipped.require_room(list(header["sha256"]))
         arrays: dict[str, Stored] = {}
         for name, digest in header["sha256"].items():
@@ -148,7 +149,7 @@ def read_archive(path: str | Path, kind: Kind) -> tuple[dict[str, Any], dict[str
 
 
 def _check_header(source: Path, kind: Kind, text: bytes) -> dict[str, Any]:
-    """Check format and version before anything else is believed."""
+    """Check format and version before the content is used."""
     try:
         header = read_strict_json(text)
     except ValueError as error:
@@ -156,7 +157,7 @@ def _check_header(source: Path, kind: Kind, text: bytes) -> dict[str, Any]:
     sums = header.get("sha256") if isinstance(header, dict) else None
     if not isinstance(sums, dict) or not {"format", "version"} <= header.keys():
         raise kind.error(f"{source} is not an orthocas {kind.name} file")
-    # One of our files: of which kind, and not from a later version.
+    # The file is ours: check its kind and version.
     name, version = header["format"], header["version"]
     if name != kind.format:
         hint = "; arms open with oc.Arm.load and orthocas solve" if name == "orthocas-arm" else ""
@@ -174,20 +175,20 @@ def _compute_digest(content: bytes) -> str:
 
 @dataclass(frozen=True, eq=False)
 class Unpacker:
-    """Entries of one zip file by name."""
+    """Reads entries of one zip file by name."""
 
     source: Path
-    what: str  #: for errors, for example 'chart'
+    what: str  #: kind of file for errors, for example 'chart'
     error: type[ArchiveError]
     archive: zipfile.ZipFile
-    sizes: dict[str, int]  #: bytes of each entry, as the file states them
-    most: int  #: bytes that may be unpacked at once
+    sizes: dict[str, int]  #: size of each entry, as the file states it [bytes]
+    most: int  #: largest total size to unpack [bytes]
 
     def read(self, name: str) -> bytes:
         """The bytes of an entry.
 
         Raises:
-            ArchiveError: the file's own, if the entry is damaged, packed in an unusual way or too large.
+            ArchiveError: if the entry is damaged, packed by an unsupported method or too large. Its class is `error`.
         """
         self.require_room([name])
         entry = self.archive.getinfo(name)
@@ -195,7 +196,7 @@ class Unpacker:
             raise self.error(f"entry {name} of {self.source} is encrypted or packed otherwise than stored or deflated")
         try:
             with self.archive.open(entry) as stream:
-                # Without a number, `read` would unpack all there is.
+                # Limit the bytes, because otherwise `read` would unpack everything.
                 content = stream.read(entry.file_size + 1)
         except _DAMAGE:
             raise self.error(f"entry {name} of {self.source} is truncated or damaged") from None
@@ -204,7 +205,7 @@ class Unpacker:
         return content
 
     def require_room(self, names: list[str]) -> None:
-        """Raise the file's error unless all these entries exist and together unpack to a sensible size."""
+        """Raise an error unless all these entries exist and unpack to an acceptable total size."""
         for name in names:
             if name not in self.sizes:
                 raise self.error(f"{self.source} is not a {self.what} file: it has no entry {name}")
@@ -221,10 +222,11 @@ def open_archive(source: Path, what: str, error: type[ArchiveError]) -> Iterator
     """Open a zip file; `what` names it in errors, for example 'chart'.
 
     Raises:
-        ArchiveError: the one given, if the file is missing, cannot be read, is no zip file, or has an entry twice.
+        ArchiveError: if the file is missing, cannot be read, is not a zip file, or has an entry twice. Its class is
+            `error`.
     """
     try:
-        # Devices and pipes may never end, or never begin.
+        # Reading from devices and pipes may never end.
         if not source.is_dir() and not stat.S_ISREG(source.stat().st_mode):
             raise OSError(errno.EINVAL, "it is a device or a pipe")
         stream = source.open("rb")
@@ -255,10 +257,10 @@ def write_npy(array: Stored) -> bytes:
 
 
 def read_npy(content: bytes) -> Stored:
-    """The array that `np.save` wrote: numbers, bools or text, no objects.
+    """The array that `np.save` wrote: numbers, bools or text, but no objects.
 
     Raises:
-        ValueError: if the bytes are anything else.
+        ValueError: for any other bytes.
     """
     begin = len(_START) + 2
     body = begin + int.from_bytes(content[len(_START) : begin], "little")
@@ -273,7 +275,7 @@ def read_npy(content: bytes) -> Stored:
     if len(shape) > RULES.axes or prod(shape) * kind.itemsize != len(content) - body:
         raise ValueError(f"{len(content) - body} bytes for the shape {shape[:5]}")
     if kind.kind == "U":
-        # Python fails on numbers that are no characters only when the text is used.
+        # Python reports invalid code points only when the text is used.
         codes = np.frombuffer(content, f"{kind.byteorder}u4", offset=body)
         if ((codes > RULES.last_character) | (codes >> 11 == RULES.surrogates)).any():
             raise ValueError("text with invalid characters")

@@ -1,4 +1,4 @@
-"""CasADi functions on sets of samples, and work in threads."""
+"""CasADi functions on sets of samples, and work shared by threads."""
 
 import os
 import sys
@@ -20,19 +20,19 @@ from orthocas.tools.cached import building
 from orthocas.tools.checks import Array
 from orthocas.tools.interrupts import deferred
 
-_CHUNKS = (1, 8, 64)  #: samples in one call: the smallest number that holds the set, or the largest
-_LARGE = 512  #: samples in one call of sets of at least so many, where starting threads pays off
+_CHUNKS = (1, 8, 64)  #: chunk sizes; a set gets the smallest one that holds it, or the largest
+_LARGE = 512  #: chunk size of sets at least this large, for which starting threads pays off
 
 
 def _count_cores() -> int:
-    """Number of cores this process may use, or OMP_NUM_THREADS if it is set, as in other libraries."""
+    """Number of cores this process may use; OMP_NUM_THREADS if it is set."""
     number = os.environ.get("OMP_NUM_THREADS", "")
     if number.isascii() and number.isdigit() and int(number) > 0:
         return int(number)
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-THREADS = _count_cores()  #: threads that mapped functions of this process use
+THREADS = _count_cores()  #: number of threads for mapped functions in this process
 
 
 def dense_function(
@@ -49,7 +49,7 @@ def dense_function(
 
 @dataclass(frozen=True)
 class Batched:
-    """A function of one sample that is called with N samples.
+    """A function of one sample, evaluated for N samples.
 
     It takes one array per input, (N, rows) for a column or (N, rows, columns) for a matrix, and returns one array per
     output in the same form. Inputs and outputs are dense.
@@ -57,7 +57,7 @@ class Batched:
 
     function: ca.Function
     _mapped: dict[int, ca.Function] = field(default_factory=dict, repr=False)
-    _mine: Any = field(default_factory=local, repr=False, compare=False)  #: memory of each thread for few samples
+    _mine: Any = field(default_factory=local, repr=False, compare=False)  #: buffers of each thread for few samples
 
     def __call__(self, *arguments: Array) -> list[Array]:
         """Evaluate N samples."""
@@ -67,7 +67,7 @@ class Batched:
             how = ("thread", THREADS) if chunk == _LARGE and THREADS > 1 else ()
             with building:
                 self._mapped[chunk] = self.function.map(chunk, *how)
-        # Large sets run in threads of CasADi; small ones in buffers that each thread keeps.
+        # Large sets use CasADi's threads. Small sets use buffers that each thread keeps.
         if chunk == _LARGE:
             return _Columns(self._mapped[chunk], chunk)(*arguments)
         if not hasattr(self._mine, "columns"):
@@ -82,11 +82,11 @@ class Batched:
 
 
 class _Columns:
-    """A function of `chunk` samples side by side as columns, with the memory of one thread; called like `Batched`."""
+    """A function of `chunk` samples side by side as columns, with buffers for one thread; called like `Batched`."""
 
     def __init__(self, function: ca.Function, chunk: int) -> None:
         self._chunk = chunk
-        # The stubs ask for sizes that the methods do not take.
+        # The type stubs require sizes that the methods do not take.
         buffer: Any
         buffer, self._run = function.buffer()
         self._buffer = buffer
@@ -103,14 +103,14 @@ class _Columns:
     def __call__(self, *arguments: Array) -> list[Array]:
         """Evaluate N samples."""
         N, chunk = len(arguments[0]), self._chunk
-        # Each sample's column (rows,) or matrix (rows, columns) as CasADi stores it, (columns, rows).
+        # Arrange each column (rows,) or matrix (rows, columns) as CasADi stores it, (columns, rows).
         columns = [a[:, None, :] if a.ndim == 2 else a.transpose(0, 2, 1) for a in arguments]
         results = [np.empty((N, *out.shape[1:])) for out in self._outputs]
         for start in range(0, N, chunk):
             count = min(chunk, N - start)
             for array, argument in zip(self._inputs, columns, strict=True):
                 array[:count] = argument[start : start + count]
-                # The last chunk is padded with a valid sample.
+                # Pad the last chunk with a valid sample.
                 if count < chunk:
                     array[count:] = argument[start]
             with deferred():
@@ -126,17 +126,17 @@ Result = TypeVar("Result")
 Tool = TypeVar("Tool")
 
 _chosen: ContextVar[int | None] = ContextVar("threads", default=None)
-_here = local()  #: .works: whether this thread is one of a pool
+_here = local()  #: `_here.works` is true in threads of a pool
 
 
 def count_threads() -> int:
-    """Number of threads that share work: what `use_threads` says, or `THREADS`; 1 within such a thread."""
+    """Number of threads that share work, set by `use_threads` (default `THREADS`); 1 inside such a thread."""
     return 1 if hasattr(_here, "works") else _chosen.get() or THREADS
 
 
 @contextmanager
 def use_threads(count: int | None) -> Iterator[None]:
-    """Let so many threads share the work of the block. None changes nothing."""
+    """Use `count` threads within this context; None changes nothing."""
     token = _chosen.set(count or _chosen.get())
     try:
         yield
@@ -145,9 +145,9 @@ def use_threads(count: int | None) -> Iterator[None]:
 
 
 def run_in_threads(work: Callable[[Piece], Result], pieces: Sequence[Piece]) -> list[Result]:
-    """Results of all pieces in their order; `count_threads` threads share the pieces.
+    """Results of all pieces in order; `count_threads` threads share the pieces.
 
-    After an exception, and after Ctrl-C, no piece is still at work.
+    After an exception or Ctrl-C, it returns only when no piece is being processed.
     """
     count = count_threads()
     if min(count, len(pieces)) < 2:
@@ -163,8 +163,8 @@ def run_in_threads(work: Callable[[Piece], Result], pieces: Sequence[Piece]) -> 
 def run_in_threads_with(
     tools: Sequence[Tool], work: Callable[[Tool, Piece], Result], pieces: Sequence[Piece]
 ) -> list[Result]:
-    """`run_in_threads` with tools that one piece at a time can use; one for each thread, or each piece, is enough."""
-    # A CasADi function must not run twice at once: threads take one, and give it back.
+    """Like `run_in_threads`, but each running piece has a tool to itself; no more tools than threads are needed."""
+    # A CasADi function must not run twice at the same time, so each thread borrows one.
     ready: SimpleQueue[Tool] = SimpleQueue()
     for tool in tools:
         ready.put(tool)
@@ -181,37 +181,37 @@ def run_in_threads_with(
 
 @cache
 def _build_pool(count: int) -> ThreadPoolExecutor:
-    """Threads that sleep while there is nothing to do: to start them for every call costs more than the work."""
+    """A pool of idle threads, because starting threads for every call costs more than the work."""
     return ThreadPoolExecutor(count, initializer=setattr, initargs=(_here, "works", True))
 
 
-# A child process has none of the threads.
+# A child process inherits no threads, so it needs a new pool.
 if hasattr(os, "register_at_fork"):
     os.register_at_fork(after_in_child=_build_pool.cache_clear)
 
 
 class _BlasHold:
-    """Holds BLAS to one thread while any caller asks for it."""
+    """Limits BLAS to one thread while at least one caller requests it."""
 
     def __init__(self) -> None:
         self._lock, self._count = Lock(), 0
         self._libraries: ThreadpoolController | None = None
-        #: modules when the libraries were searched, which takes 1 ms
+        #: number of modules at the last search for libraries, which takes 1 ms
         self._modules = 0
         self._limits: Any = None
 
     def begin(self) -> None:
-        """Limit BLAS to one thread, if no other caller has."""
+        """Limit BLAS to one thread unless another caller already has."""
         with self._lock:
             if not self._count:
-                # New modules may have brought libraries.
+                # Modules that were imported since may have loaded libraries.
                 if self._libraries is None or self._modules != len(sys.modules):
                     self._libraries, self._modules = ThreadpoolController(), len(sys.modules)
                 self._limits = self._libraries.limit(limits=1, user_api="blas")
             self._count += 1
 
     def end(self) -> None:
-        """One less wants it; after the last one BLAS has its threads back."""
+        """Withdraw one request; after the last one, BLAS gets its threads back."""
         with self._lock:
             self._count -= 1
             if not self._count and self._limits is not None:
@@ -223,7 +223,7 @@ _hold = _BlasHold()
 
 @contextmanager
 def one_blas_thread() -> Iterator[None]:
-    """Hold BLAS to one thread, in the whole process; the end of the last block gives the others back."""
+    """Limit BLAS to one thread in the whole process; the limit ends with the last such context."""
     _hold.begin()
     try:
         yield

@@ -1,7 +1,7 @@
-"""Dense MX graphs at BLAS speed: NumPy evaluates the matrix products and tanh of a finished graph.
+"""Dense MX graphs at BLAS speed: NumPy evaluates matrix products and tanh of a finished graph.
 
-CasADi multiplies dense matrices with a triple loop, and differentiation drops any other choice of kernel. So CasADi
-builds the whole graph, derivatives included, and the products are replaced at the end.
+CasADi multiplies dense matrices with a triple loop, and its derivatives do not keep replaced kernels. So CasADi builds
+the whole graph with derivatives, and the products are replaced at the end.
 """
 
 from collections.abc import Callable, Sequence
@@ -16,7 +16,7 @@ from orthocas.tools.interrupts import deferred
 
 
 class DenseNode(ca.Callback):
-    """A node of an MX graph with dense matrices, which Python evaluates; subclasses have `eval_buffer`."""
+    """A node of an MX graph with dense matrices, evaluated in Python; subclasses have `eval_buffer`."""
 
     def __init__(self, name: str, inputs: Sequence[tuple[int, int]], outputs: Sequence[tuple[int, int]]) -> None:
         ca.Callback.__init__(self)
@@ -40,7 +40,7 @@ class DenseNode(ca.Callback):
         return ca.Sparsity.dense(*self._outputs[i])
 
     def has_eval_buffer(self) -> bool:
-        """Tell CasADi to pass buffers, so that nothing is copied."""
+        """Make CasADi pass buffers, so that nothing is copied."""
         return True
 
 
@@ -91,12 +91,12 @@ class NumpyGraph:
         outputs: expressions of these symbols; derivatives are allowed.
 
     Attributes:
-        function: the CasADi function. It is valid as long as this object lives, which owns its nodes.
+        function: the CasADi function. It is valid only while this object exists, which owns its nodes.
     """
 
     def __init__(self, name: str, inputs: Sequence[ca.MX], outputs: Sequence[ca.MX]) -> None:
         self._nodes: list[NumpyNode] = []
-        # CasADi calls the nodes for their shapes, and would swallow Ctrl-C there.
+        # CasADi calls the nodes for their shapes, and would swallow Ctrl-C during these calls.
         with deferred():
             self.function = ca.Function(name, list(inputs), self._rewrite(inputs, ca.cse(list(outputs))))
         self._memory = local()
@@ -104,9 +104,9 @@ class NumpyGraph:
     def __call__(self, *inputs: Array) -> list[Array]:
         """Evaluate without copies. Inputs and outputs are transposed matrices, contiguous and of the right size.
 
-        Large graphs need large scratch memory. Every thread keeps its own from call to call.
+        Large graphs need large scratch memory, which each thread keeps between calls.
         """
-        # Memory of this thread, built at its first call.
+        # Create this thread's memory at its first call.
         if not hasattr(self._memory, "buffer"):
             self._memory.buffer, self._memory.evaluate = self.function.buffer()
         buffer, evaluate = self._memory.buffer, self._memory.evaluate
@@ -120,8 +120,8 @@ class NumpyGraph:
         return results
 
     def build_block_function(self) -> Callable[[Array], Array]:
-        """A function of this graph's one input with its own memory. It returns the same array at every call."""
-        # The stubs of set_arg and set_res ask for a size, the methods take none.
+        """A function of this graph's single input with its own memory. It returns the same array at every call."""
+        # The type stubs of set_arg and set_res require a size, which the methods do not take.
         buffer: Any
         buffer, evaluate = self.function.buffer()
         values, result = (np.empty(size[::-1]) for size in (self.function.size_in(0), self.function.size_out(0)))
@@ -129,7 +129,7 @@ class NumpyGraph:
 
         def run(block: Array) -> Array:
             values[...] = block.T
-            # This also keeps the buffer alive, which `evaluate` does not.
+            # The closure also keeps the buffer alive, which `evaluate` does not.
             buffer.set_res(0, result.data)
             with deferred():
                 evaluate()
@@ -138,7 +138,7 @@ class NumpyGraph:
         return run
 
     def _rewrite(self, inputs: Sequence[ca.MX], outputs: list[ca.MX]) -> list[ca.MX]:
-        """Cut the graph at its expensive nodes, and join the pieces with NumPy's nodes in between."""
+        """Cut the graph at its expensive nodes, and reconnect the pieces through NumPy nodes."""
         plain = ca.Function("plain", list(inputs), outputs)
         heavy = [
             plain.instruction_MX(k)
@@ -148,13 +148,13 @@ class NumpyGraph:
         if not heavy:
             return outputs
         cuts = [ca.MX.sym("cut", *node.shape) for node in heavy]
-        # The operands of each node without a transposition, and whether they had one.
+        # Operands of each node without transposition, and whether each was transposed.
         operands = []
         for node in heavy:
             deps = [node.dep(i) for i in range(node.n_dep())]
             operands.append([(x.dep(0), True) if x.op() == ca.OP_TRANSPOSE else (x, False) for x in deps])
         pieces = iter(ca.graph_substitute([x for xs in operands for x, _ in xs] + outputs, heavy, cuts))
-        # In their places NumPy's nodes, for products z + x y (operands z, x, y) and for tanh.
+        # Replace products z + x y (operands z, x, y) and tanh by NumPy nodes.
         definitions = []
         for node, xs in zip(heavy, operands, strict=True):
             flips, parts = [flipped for _, flipped in xs], [next(pieces) for _ in xs]

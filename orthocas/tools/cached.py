@@ -1,7 +1,7 @@
 """Values that an object builds on first use: once for all threads, and never pickled or copied with the object.
 
-CasADi functions with nodes in Python, buffers and compiled libraries can be neither pickled nor copied. They follow
-from the object's data, so a copy builds its own when needed.
+CasADi functions with Python nodes, buffers, and compiled libraries can neither be pickled nor copied. They follow from
+the object's data, so a copy builds its own on first use.
 """
 
 from collections.abc import Callable, Hashable
@@ -57,14 +57,14 @@ class _CachedProperty(Generic[T]):
 
 
 if TYPE_CHECKING:
-    # To type checkers it is a property, also in protocols.
+    # Type checkers see a property, also in protocols.
     from builtins import property as cached_property
 else:
     cached_property = _CachedProperty
 
 
 class BuiltOnUse(Generic[K, T]):
-    """Values by name, each built on first use, once for all threads. A `cached_property` should hold it."""
+    """Values by name, each built on first use, once for all threads. Hold it in a `cached_property`."""
 
     def __init__(self, build: Callable[[K], T]) -> None:
         self._build = build

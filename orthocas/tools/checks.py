@@ -22,11 +22,11 @@ Flags = NDArray[np.bool_]
 
 _LONGEST_TEXT = 500  #: characters of a name
 _REAL = "biuf"  #: NumPy's kinds of numbers: bool, int, unsigned, float
-_NO_NUMBER = (str, bytes, complex, type(None))  #: rejected although NumPy converts them
+_NO_NUMBER = (str, bytes, complex, type(None))  #: types that are rejected although NumPy converts them
 
 
 def import_extra(package: str, feature: str, extra: str) -> ModuleType:
-    """A package that only one feature needs; raise MissingExtraError if it is not installed."""
+    """Import a package that only one feature needs; raise MissingExtraError if it is not installed."""
     try:
         return import_module(package)
     except ModuleNotFoundError:
@@ -92,7 +92,7 @@ def freeze_indices(name: str, value: ArrayLike, shape: tuple[int | None, ...], c
         ShapeError: if the shape differs.
         InvalidValueError: if an entry is not a whole number from 0 to count - 1.
     """
-    # Floats hold whole numbers exactly up to 2^53.
+    # Floats represent integers exactly up to 2^53.
     numbers = as_float_array(name, value)
     require_shape(name, numbers.shape, shape)
     bad = ~((numbers >= 0) & (numbers < count) & (numbers == np.floor(numbers)))
@@ -107,17 +107,17 @@ def as_float_array(name: str, value: Any) -> Array:
     """Convert to a float array.
 
     Raises:
-        InvalidValueError: if the value is not real numbers: text (even "1.0"), complex numbers, None, expressions, or
-            masked entries: NumPy would hand over whatever is below the mask.
+        InvalidValueError: if the value does not consist of real numbers: text (even "1.0"), complex numbers, None,
+            expressions, or arrays with masked entries, whose hidden values NumPy would use.
     """
     if np.ma.is_masked(value) or (isinstance(value, list | tuple) and any(map(np.ma.is_masked, value))):
-        raise InvalidValueError(name, "an array with masked entries", "numbers everywhere")
+        raise InvalidValueError(name, "an array with masked entries", "an array without masked entries")
     try:
         array = np.asarray(value)
         kind = array.dtype.kind
         if kind in _REAL or (kind == "O" and not any(isinstance(entry, _NO_NUMBER) for entry in array.flat)):
             return np.asarray(array, dtype=float)
-    # RuntimeError stands for CasADi expressions inside lists.
+    # RuntimeError: CasADi expressions inside lists.
     except (TypeError, ValueError, OverflowError, RuntimeError):
         pass
     raise InvalidValueError(name, repr(value)[:80], "an array of numbers")
@@ -127,8 +127,8 @@ def as_number(name: str, value: Any) -> float:
     """Convert one number of Python, NumPy or CasADi to a float.
 
     Raises:
-        InvalidValueError: for anything else, lists and tensors of one number included: many callers only check that a
-            value is a number, and go on with the value itself.
+        InvalidValueError: for anything else, including lists and tensors with one number: many callers only check that
+            a value is a number, and continue with the original value.
     """
     if not isinstance(value, Real | np.ndarray | ca.DM) or (isinstance(value, np.ndarray) and value.ndim):
         raise InvalidValueError(name, repr(value)[:80], "a number")
@@ -142,7 +142,7 @@ def as_path(name: str, value: Any) -> Path:
     """Convert a file name to a path.
 
     Raises:
-        InvalidValueError: for anything but text or a path, and for text that no file system accepts.
+        InvalidValueError: for values other than text or a path, and for text that no file system accepts.
     """
     if not isinstance(value, str | os.PathLike) or "\0" in (text := os.fspath(value)):
         raise InvalidValueError(name, repr(value)[:80], "a path")
@@ -165,7 +165,7 @@ def as_rows(name: str, value: ArrayLike, n: int) -> tuple[Array, bool]:
         ShapeError: if the last axis does not have n entries.
     """
     array = as_float_array(name, value)
-    # columns, as CasADi returns them, are one point
+    # A column, as CasADi returns it, is one point.
     if n > 1 and array.shape == (n, 1):
         array = array[:, 0]
     single = array.ndim == 1
@@ -191,7 +191,7 @@ def as_point(name: str, value: ArrayLike, n: int) -> Array:
     """One point, (n,) or a column (n, 1), as a read-only copy (n,).
 
     Raises:
-        ShapeError, InvalidValueError: as `as_point_set`. A set of points raises ShapeError.
+        ShapeError, InvalidValueError: as in `as_point_set`. A set of points raises ShapeError.
     """
     points, single = as_point_set(name, value, n)
     if not single:
@@ -214,7 +214,7 @@ def require_kind(name: str, value: object, kind: type) -> None:
         raise InvalidValueError(name, received, f"a {kind.__name__}{hint}")
 
 
-#: by class: how to make one, for the end of a message
+#: class -> how to make an object of it, for the end of a message
 _MAKERS = {
     "Task": ", such as oc.Task.pose(robot)",
     "Problem": ", such as oc.Problem(robot, task), or oc.problems.get(name)",
@@ -225,7 +225,7 @@ _MAKERS = {
 
 
 def suggest_attribute(value: object, kind: type) -> str:
-    """The end of a message about a value that has an instance of `kind`, as a fit has a chart; "" for others."""
+    """Hint for a value with an attribute of class `kind`, as a fit has a chart; "" for other values."""
     name = kind.__name__.lower()
     return f": use its attribute '{name}'" if isinstance(getattr(value, name, None), kind) else ""
 

@@ -1,4 +1,4 @@
-"""Large SX functions on columns of samples, and in blocks of samples shared by threads."""
+"""Large SX functions evaluated on columns of samples, in blocks that threads share."""
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
@@ -16,10 +16,10 @@ from orthocas.tools.expressions import Tape, replay, write_tape
 
 COLUMNS = 256  #: samples in a block
 NARROW = 64  #: samples in a block of small sets
-MANY = 9  #: joint positions from which blocks pay off: `Batched` takes 1, 8 or 64 at once
-_PIECE = 8 * COLUMNS  #: joint positions that a thread takes at once
+MANY = 9  #: number of joint positions from which blocks pay off; `Batched` takes 1, 8 or 64 at once
+_PIECE = 8 * COLUMNS  #: number of joint positions per task of a thread
 
-#: Evaluates contiguous inputs (entries, c), and writes contiguous outputs (entries, c).
+#: evaluates contiguous inputs (entries, c), and writes contiguous outputs (entries, c)
 Run = Callable[[Sequence[Array], Sequence[Array]], None]
 
 
@@ -44,18 +44,18 @@ def split_by_sample(blocks: Array, samples: int, every: int = 1) -> Array:
     Args:
         blocks: entries of matrices, column by column.
         samples: number N of samples, without the padding.
-        every: take only every second, third, ... sample.
+        every: keep only every second, third, ... sample.
     """
     stack = blocks.transpose(0, 3, 2, 1).reshape(-1, blocks.shape[2], blocks.shape[1])
     return stack[:samples:every] if every == 1 else np.ascontiguousarray(stack[:samples:every])
 
 
 class ColumnFunction:
-    """A dense SX function of one sample, for blocked arrays.
+    """A dense SX function of one sample, evaluated on blocked arrays.
 
     Args:
         function: a function with any number of matrix inputs and outputs.
-        columns: samples in a block, c.
+        columns: number c of samples in a block.
     """
 
     def __init__(self, function: ca.Function, columns: int = COLUMNS) -> None:
@@ -66,7 +66,7 @@ class ColumnFunction:
         blocks, count = len(arguments[0]), count_threads()
         results = [np.empty((blocks, *shape)) for shape in self._shapes]
 
-        # Every thread takes every n-th block, with memory of its own.
+        # Of n threads, each takes every n-th block, with its own memory.
         def evaluate(run: Run, part: range) -> None:
             for b in part:
                 run([argument[b] for argument in arguments], [result[b] for result in results])
@@ -77,10 +77,10 @@ class ColumnFunction:
 
     @contextmanager
     def borrow(self, count: int) -> Iterator[list[Run]]:
-        """Functions of blocks for so many threads, with scratch memory that nobody else uses meanwhile.
+        """Lend `count` functions of blocks, with scratch memory that nobody else uses meanwhile.
 
-        They are kept for the next time. CasADi lets go of Python's lock while it evaluates. It must not build in a
-        thread of a pool: its own lock against Python's is a deadlock.
+        They are kept for later calls. CasADi releases Python's lock (GIL) while it evaluates. Functions must not be
+        built in a thread of a pool, because CasADi's lock and the GIL would deadlock.
         """
         runs: list[Run] = []
         for _ in range(count):
@@ -94,7 +94,7 @@ class ColumnFunction:
             self._spare.extend(runs)
 
     def build_block_function(self) -> Callable[..., list[Array]]:
-        """A function of contiguous inputs (entries, c) that returns the same arrays (entries, c) at every call."""
+        """A function of contiguous inputs (entries, c). It returns the same arrays (entries, c) at every call."""
         run, results = self._build_run(), [np.empty(shape) for shape in self._shapes]
 
         def evaluate(*arguments: Array) -> list[Array]:
@@ -104,7 +104,7 @@ class ColumnFunction:
         return evaluate
 
     def _build_run(self) -> Run:
-        # The stubs of set_arg and set_res ask for a size, the methods take none.
+        # The type stubs of set_arg and set_res require a size, which the methods do not take.
         buffer: Any
         buffer, evaluate = self._on_block.buffer()
 
@@ -119,7 +119,7 @@ class ColumnFunction:
 
     @cached_property
     def _spare(self) -> list[Run]:
-        """Functions that nobody uses now."""
+        """Free functions."""
         return []
 
     @property
@@ -141,7 +141,7 @@ class ColumnFunction:
 
     @property
     def supported(self) -> bool:
-        """Whether tapes know all operations of the function."""
+        """Whether tapes support all operations of the function."""
         try:
             return bool(self.tape)
         except OrthocasError:
@@ -153,7 +153,7 @@ class ColumnFunction:
         shapes = [self._function.size_in(i) for i in range(self._function.n_in())]
         column = ca.SX.sym("x", sum(rows * columns for rows, columns in shapes))
         parts, start = [], 0
-        # one column holds all inputs, matrices column by column
+        # One column holds all inputs, with matrices column by column.
         for rows, columns in shapes:
             parts.append(ca.reshape(column[start : start + rows * columns], rows, columns))
             start += rows * columns
@@ -162,7 +162,7 @@ class ColumnFunction:
         return write_tape(ca.Function("flat", [column], [ca.cse(stacked)]))
 
 
-#: A function of contiguous columns (n, c) with its own scratch memory; it may return the same array at every call.
+#: a function of contiguous columns (n, c) with its own scratch memory; it may return the same array at every call
 BlockFunction = Callable[..., Array]
 
 
@@ -170,13 +170,13 @@ def fill(results: NDArray[Any], points: Array, make: Callable[[], BlockFunction]
     """Write a function's values at points (N, n) to `results`, (N, ...), which may be part of a larger array.
 
     Args:
-        results: the values; entries of one sample in row-major order.
+        results: output array; the entries of a sample are in row-major order.
         points: joint positions.
-        make: makes the function (n, c) -> (entries, c), once for each thread.
+        make: builds a function (n, c) -> (entries, c); called once per thread.
         others: further arguments of the function, (N, k) each.
     """
     starts = range(0, len(points), _PIECE)
-    # Functions are not built in the threads, see `ColumnFunction.borrow`.
+    # Build functions outside the threads, see `ColumnFunction.borrow`.
     functions = [make() for _ in range(min(count_threads(), len(starts)))]
 
     def fill_piece(function: BlockFunction, start: int) -> None:
@@ -187,31 +187,31 @@ def fill(results: NDArray[Any], points: Array, make: Callable[[], BlockFunction]
 
 
 def fill_blocks(results: NDArray[Any], function: BlockFunction, columns: int, *arguments: Array) -> None:
-    """Fill the results in this thread, by calls of one function on blocks of `columns` columns."""
+    """Fill the results in this thread by calls of one function on blocks of `columns` columns."""
     for first in range(0, len(results), columns):
         count, blocks = min(columns, len(results) - first), [np.empty((array.shape[1], columns)) for array in arguments]
         for block, array in zip(blocks, arguments, strict=True):
-            # Samples as columns; the last block is padded with its first sample.
+            # Samples become columns. The last block is padded with its first sample.
             block[:, :count] = array[first : first + count].T
             block[:, count:] = array[first : first + 1].T
         values = function(*blocks)
         by_entry = values.reshape(*results.shape[1:], columns)[..., :count]
-        # moveaxis takes longer
+        # moveaxis is slower.
         results[first : first + columns] = by_entry.transpose(-1, *range(by_entry.ndim - 1))
 
 
 class BlockedFunction:
-    """A dense SX function of columns, q (n, 1) first, for sets of any size; it is called like `Batched`.
+    """A dense SX function of columns, the first of them q (n, 1), for sets of any size; called like `Batched`.
 
     Args:
-        function: the function, with one output: a column, or a matrix.
+        function: the function, with one output, which is a column or a matrix.
     """
 
     def __init__(self, function: ca.Function) -> None:
         self._function, self._few = function, Batched(function)
 
     def __call__(self, points: Array, *others: Array) -> list[Array]:
-        """Values (N, rows) or (N, rows, columns) at points (N, n), and at rows of the other inputs (N, k)."""
+        """Values (N, rows) or (N, rows, columns) at points (N, n), and at rows (N, k) of the other inputs."""
         rows, columns = self._function.size_out(0)
         shape = (len(points), rows) if columns == 1 else (len(points), rows, columns)
         return [self.into(np.empty(shape), points, *others)]
@@ -219,23 +219,23 @@ class BlockedFunction:
     def into(self, results: Array, points: Array, *others: Array) -> Array:
         """Write the values to `results`, which may be part of a larger array, and return it."""
         if len(points) < MANY or self._by_rows is None:
-            # single points, or operations that columns do not know
+            # Single points, or operations that columns do not support.
             results[...] = self._few(points, *others)[0].reshape(results.shape)
         elif len(points) <= 2 * NARROW:
             try:
-                # narrow blocks for few points, with memory that is kept
+                # Few points: narrow blocks with reused memory.
                 function = self._spare.pop()
             except IndexError:
                 function = self._build_function(narrow=True)
             fill_blocks(results, function, NARROW, points, *others)
             self._spare.append(function)
         else:
-            # wide blocks, shared by threads
+            # Many points: wide blocks shared by threads.
             fill(results, points, self._build_function, *others)
         return results
 
     def _build_function(self, narrow: bool = False) -> BlockFunction:
-        """The function of a block."""
+        """The function on one block."""
         rows = ColumnFunction(self._entries, NARROW) if narrow else self._by_rows
         assert rows is not None
         run = rows.build_block_function()
@@ -243,7 +243,7 @@ class BlockedFunction:
 
     @cached_property
     def _spare(self) -> list[BlockFunction]:
-        """Functions of narrow blocks that nobody uses now."""
+        """Free functions of narrow blocks."""
         return []
 
     @cached_property

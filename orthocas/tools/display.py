@@ -1,4 +1,4 @@
-"""Facts about an object by name, as lines of text and as an HTML table."""
+"""Display of an object's facts as lines of text and as an HTML table."""
 
 import html
 import math
@@ -7,8 +7,10 @@ from collections.abc import Iterable, Mapping
 from decimal import ROUND_CEILING, ROUND_FLOOR, Decimal
 from typing import TYPE_CHECKING, Any
 
-_WIDTH = 100  # characters per line
-_LINES = 9  # at most, including the heading
+# Characters per line.
+_WIDTH = 100
+# Largest number of lines, with the heading.
+_LINES = 9
 
 
 class Shown:
@@ -26,10 +28,11 @@ class Shown:
         """One line that describes the object."""
         return next(iter(self.facts().values()))
 
-    if not TYPE_CHECKING:  # type checkers would take every name for known
+    # Otherwise type checkers would accept every name.
+    if not TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> Any:
-            """Say what to use where a name is one that people try first."""
+            """Raise AttributeError, with a hint for names that people often guess."""
             owners = [kind.__name__ for kind in type(self).__mro__ if name in GUESSES.get(kind.__name__, ())]
             raise AttributeError(explain_missing((owners or [type(self).__name__])[0], name), name=name, obj=self)
 
@@ -45,7 +48,7 @@ def as_text(title: str, facts: Mapping[str, str]) -> str:
     (_, heading), *others = facts.items()
     width = max((len(name) for name, _ in others), default=0) + 2
     lines = [f"{title}: {heading}", *(f"  {name:<{width}}{value}" for name, value in others[: _LINES - 1])]
-    # Without control characters, and cut to the width between two words, where there are any.
+    # Remove control characters, and cut lines between words if possible.
     for k, line in enumerate(lines):
         indent = line[: len(line) - len(line.lstrip())]
         words = "".join(letter if letter.isprintable() else " " for letter in line.strip())
@@ -66,14 +69,15 @@ def as_html(title: str, facts: Mapping[str, str]) -> str:
 
 
 def percent(share: float, digits: int = 1, *, fault: bool = False) -> str:
-    """A share in percent, rounded down: 0.99999 is '99.9%', and only 1 is '100.0%'.
+    """A fraction in percent, rounded down: 0.99999 is '99.9%', and only 1 is '100.0%'.
 
-    Shares of faults, such as folded samples, are rounded up, so that neither reads better than it is. NaN is 'unknown'.
+    Fractions of faults, such as folded samples, are rounded up, so that rounding never improves a result. NaN is
+    'unknown'.
 
     Args:
-        share: a number, 1 for all.
-        digits: after the decimal point.
-        fault: whether a smaller share would be better.
+        share: a fraction from 0 to 1.
+        digits: digits after the decimal point.
+        fault: whether smaller is better.
     """
     if math.isnan(share):
         return "unknown"
@@ -82,14 +86,14 @@ def percent(share: float, digits: int = 1, *, fault: bool = False) -> str:
 
 
 def listed(words: Iterable[str], most: int = 10) -> str:
-    """Join words with commas, and say how many more there are."""
+    """Join at most `most` words with commas, and state how many more there are."""
     known = list(words)
     more = f", and {len(known) - most} more" if len(known) > most else ""
     return ", ".join(known[:most]) + more
 
 
 def number_list(values: Iterable[float]) -> str:
-    """Join numbers of four digits like `listed`. Equal numbers are shown once."""
+    """Join numbers with four digits like `listed`. If all numbers are equal, one is shown."""
     known = [f"{value:.4g}" for value in values]
     return known[0] if len(set(known)) == 1 else listed(known)
 
@@ -100,7 +104,7 @@ _POSE = "robot.pose(q, frame), or chart.x(q) for the task"
 _LAW = "law.function(q, dq, phi, dphi, ddphi, *gains), and gains of law.gains.values()"
 _GENERATE = "oc.generate_c(chart, folder, law)"
 
-#: by class, or "orthocas" for the package: what to use, and the names that people try first
+#: class, or "orthocas" for the package -> hint -> names that people often guess
 _NAMES: Mapping[str, Mapping[str, str]] = {
     "orthocas": {
         _SOLVE: "solve solve_ik inverse_kinematics ik Solver IK",
@@ -219,14 +223,14 @@ _NAMES: Mapping[str, Mapping[str, str]] = {
         _GENERATE: "codegen generate_c",
     },
 }
-#: the same by name
+#: class -> name -> hint
 GUESSES = {
     owner: {name: use for use, names in answers.items() for name in names.split()} for owner, answers in _NAMES.items()
 }
 
 
 def explain_missing(owner: str, name: str) -> str:
-    """The message of an AttributeError: what does not exist, and what serves in its place if that is known."""
+    """The message of an AttributeError: the missing name, and the right one if it is known."""
     what = "module 'orthocas'" if owner == "orthocas" else f"'{owner}' object"
     instead = GUESSES.get(owner, {}).get(name)
     return f"{what} has no attribute '{name}'" + (f": use {instead}" if instead else "")

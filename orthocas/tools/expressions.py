@@ -1,4 +1,4 @@
-"""SX expressions as data: tapes for files, their structure, scalar code, and users' functions of q."""
+"""SX expressions as data: tapes for files, their structure, scalar code, and user functions of q."""
 
 import re
 from collections.abc import Callable, Sequence
@@ -14,8 +14,8 @@ from orthocas.errors import InvalidValueError, OrthocasError
 from orthocas.tools.checks import Array, require_count
 from orthocas.tools.interrupts import deferred
 
-_LARGEST = 1e300  #: of finite constants
-#: operations that Python and C write alike
+_LARGEST = 1e300  #: largest absolute value of constants
+#: operations with the same form in Python and C
 ARITHMETIC = {
     "neg": "-{0}",
     "sq": "{0} * {0}",
@@ -27,27 +27,27 @@ ARITHMETIC = {
     "mul": "{0} * {1}",
     "div": "{0} / {1}",
 }
-#: operations on one number, by their names in tapes
+#: operations on one operand, by their names on tapes
 UNARY = (
     *("neg", "exp", "log", "sqrt", "sq", "twice", "sin", "cos", "tan", "asin", "acos", "atan", "sinh", "cosh", "tanh"),
     *("inv", "fabs", "sign", "not", "floor", "ceil", "erf", "log1p", "expm1", "asinh", "acosh", "atanh", "assign"),
 )
-#: on two
+#: operations on two operands
 BINARY = (
     *("add", "sub", "mul", "div", "pow", "constpow", "atan2", "hypot", "fmod", "copysign", "fmin", "fmax"),
     *("lt", "le", "eq", "ne", "and", "or", "if_else_zero"),
 )
-MOST_ROWS = 12  #: of a determinant
-_BY_CASADI = 5  #: rows of determinants that CasADi writes out well
+MOST_ROWS = 12  #: largest number of rows of a determinant
+_BY_CASADI = 5  #: rows up to which CasADi's own determinant is efficient
 _LINEAR = ("assign", "neg", "twice", "add", "sub")
-WRITTEN_OUT = 10  #: rows of the largest matrices whose products and inverses are written out
+WRITTEN_OUT = 10  #: rows of the largest matrices whose products and inverses become scalar code
 Tape = dict[str, Any]
 Entry = TypeVar("Entry", ca.SX, ca.MX)
 Value = TypeVar("Value")
 
 
 class HoldsFunctions:
-    """Base of objects with CasADi functions among their fields; pickles record the version of CasADi."""
+    """Base of objects with CasADi functions among their fields; pickles record CasADi's version."""
 
     def __getstate__(self) -> dict[str, Any]:
         """The fields, with functions as text."""
@@ -58,10 +58,10 @@ class HoldsFunctions:
         }
 
     def __setstate__(self, state: dict[str, Any]) -> None:
-        """The object again.
+        """Restore the object.
 
         Raises:
-            InvalidValueError: if this CasADi cannot read what another one wrote.
+            InvalidValueError: if this version of CasADi cannot read functions of another version.
         """
         for name, value in state.items():
             object.__setattr__(self, name, value.read() if isinstance(value, _Written) else value)
@@ -69,20 +69,20 @@ class HoldsFunctions:
 
 @dataclass(frozen=True)
 class _Written:
-    """A function in a pickle."""
+    """A function as text in a pickle."""
 
     text: str
-    version: str  #: of CasADi
+    version: str  #: version of CasADi
 
     def read(self) -> ca.Function:
         try:
             return ca.Function.deserialize(self.text)
         except RuntimeError:
             expected = f"one of CasADi {ca.CasadiMeta.version()}; files of charts outlive versions"
-            raise InvalidValueError("pickle", f"of CasADi {self.version}", expected) from None
+            raise InvalidValueError("pickle", f"from CasADi {self.version}", expected) from None
 
 
-#: CasADi's numbers of the operations
+#: CasADi's codes of the operations
 CODES = {name: int(getattr(ca, f"OP_{name.upper()}")) for name in (*UNARY, *BINARY)}
 _NAMES: dict[int, str] = {code: name for name, code in CODES.items()} | {
     getattr(ca, f"OP_{name.upper()}"): name for name in ("const", "input", "output")
@@ -101,7 +101,7 @@ def write_tape(function: ca.Function) -> Tape:
         operation = function.instruction_id(k)
         if operation not in _NAMES:
             raise OrthocasError(f"custom expression uses CasADi operation {operation}, which chart files cannot store")
-        # A step is its operation, the place of its result, and a number or places of operands.
+        # A step holds its operation, the slot of its result, and a number or the slots of its operands.
         name, into, of = _NAMES[operation], function.instruction_output(k), function.instruction_input(k)
         if name == "const":
             steps.append([name, into[0], function.instruction_constant(k)])
@@ -115,12 +115,13 @@ def write_tape(function: ca.Function) -> Tape:
 
 
 def require_tape(tape: Tape, inputs: int) -> None:
-    """Check a tape that comes from a file, before anything is built.
+    """Check a tape from a file before anything is built.
 
     Raises:
-        InvalidValueError: if it is not a tape of an expression of that many inputs; the step to blame is named.
+        InvalidValueError: if it is not a tape of an expression with this number of inputs. The message names the bad
+            step.
     """
-    # The outer form, then each step on what earlier ones wrote.
+    # Check the outer form, then each step: its operands must be results of earlier steps.
     keys = tape.keys() if isinstance(tape, dict) else ()
     if set(keys) != {"rows", "columns", "steps"} or not isinstance(tape["steps"], list | tuple):
         raise InvalidValueError("tape", f"an object with {sorted(keys)[:5]}", "one with rows, columns and steps")
@@ -136,7 +137,7 @@ def require_tape(tape: Tape, inputs: int) -> None:
 
 
 def _is_step(step: Any, inputs: int, written: set[int]) -> bool:
-    """Whether a step is [operation, place of the result, what it needs ...]."""
+    """Whether a step is [operation, slot of the result, operands ...]."""
     if not isinstance(step, list | tuple) or len(step) < 3 or not isinstance(step[0], str) or not _is_index(step[1]):
         return False
     name, _, *of = step
@@ -144,7 +145,7 @@ def _is_step(step: Any, inputs: int, written: set[int]) -> bool:
         return len(of) == 1 and isinstance(of[0], int | float) and (abs(of[0]) <= _LARGEST or abs(of[0]) == inf)
     if name == "input":
         return len(of) == 1 and _is_index(of[0]) and of[0] < inputs
-    # operands are results of earlier steps
+    # Operands are results of earlier steps.
     needs = 2 if name in BINARY else 1
     return (
         (name in UNARY or name in BINARY or name == "output")
@@ -161,7 +162,7 @@ def read_tape(tape: Tape, q: ca.SX) -> ca.SX:
     """Rebuild the expression of a tape at q (n, 1).
 
     Raises:
-        InvalidValueError: if it is no tape for n inputs.
+        InvalidValueError: if it is not a tape for n inputs.
     """
     require_tape(tape, q.shape[0])
     entries = replay(tape, [q[i] for i in range(q.shape[0])])
@@ -171,12 +172,12 @@ def read_tape(tape: Tape, q: ca.SX) -> ca.SX:
 def evaluate_tape(
     tape: Tape, leaf: Callable[[str, Any], Value], step: Callable[[str, Sequence[Value]], Value]
 ) -> list[Value]:
-    """What a tape computes in any arithmetic: its outputs, column by column.
+    """Evaluate a tape in any arithmetic; returns its outputs, column by column.
 
     Args:
-        tape: the tape, checked.
-        leaf: takes "const" and a number, or "input" and its index.
-        step: takes the name of an operation and its operands.
+        tape: a checked tape.
+        leaf: called with "const" and a number, or with "input" and an index.
+        step: called with the name of an operation and its operands.
     """
     work: dict[int, Value] = {}
     results: dict[int, Value] = {}
@@ -191,10 +192,10 @@ def evaluate_tape(
 
 
 def replay(tape: Tape, inputs: Sequence[Entry]) -> list[Entry]:
-    """The entries of a checked tape's output, column by column, for the entries of its input."""
-    # Static methods of the type take a tenth of the time of operators on Python's side.
+    """Evaluate a checked tape on the entries of its input; returns the entries of its output, column by column."""
+    # Static methods of the type take a tenth of the time of Python's operators.
     kind: Any = type(inputs[0])
-    # It gives constants the shape of the entries.
+    # Constants get the shape of the entries.
     zero = 0 * inputs[0]
 
     def step(name: str, of: Sequence[Any]) -> Any:
@@ -204,7 +205,7 @@ def replay(tape: Tape, inputs: Sequence[Entry]) -> list[Entry]:
 
 
 Joints = frozenset[int]
-Gradient = dict[int, Joints]  #: the joints that each derivative depends on; missing ones are 0
+Gradient = dict[int, Joints]  #: joints that each derivative depends on; missing derivatives are 0
 _NOTHING: Joints = frozenset()
 
 
@@ -219,7 +220,7 @@ def find_gradient_dependences(tape: Tape) -> list[Gradient]:
 
 
 def _combine_dependences(name: str, of: Sequence[tuple[Joints, Gradient]]) -> tuple[Joints, Gradient]:
-    """The joints that the result of a step and its derivatives depend on."""
+    """The joints on which the result of a step and its derivatives depend."""
     values = [joints for joints, _ in of]
     everything = frozenset().union(*values)
     partials = [everything] * len(values)
@@ -229,7 +230,7 @@ def _combine_dependences(name: str, of: Sequence[tuple[Joints, Gradient]]) -> tu
         partials = values[::-1]
     elif name == "div":
         partials[0] = values[1]
-    # By the chain rule: what a partial derivative and the operand's own depend on.
+    # Chain rule: union over partial derivatives and derivatives of operands.
     total: Gradient = {}
     for partial, (_, part) in zip(partials, of, strict=True):
         for j, own in part.items():
@@ -238,12 +239,12 @@ def _combine_dependences(name: str, of: Sequence[tuple[Joints, Gradient]]) -> tu
 
 
 def choose_form(graph: ca.Function, rows: int) -> ca.Function:
-    """Scalar code of a graph with matrices of so many rows, or the graph itself where that would be too long."""
+    """Scalar code of a graph for matrices with so many rows, or the graph itself if the code would be too long."""
     return expand_scalars(graph) if rows <= WRITTEN_OUT else graph
 
 
 def expand_scalars(function: ca.Function) -> ca.Function:
-    """Expand a function into scalar operations. One that cannot be expanded (a network) is returned as it is."""
+    """Expand a function into scalar operations. A function that cannot be expanded (a network) stays as it is."""
     # `expand` turns Ctrl-C into a RuntimeError.
     with deferred():
         try:
@@ -272,15 +273,15 @@ def build_expression(what: str, function: Callable[[ca.SX], ca.SX] | ca.Function
 
 
 def call_user(what: str, expected: str, function: Callable[..., Any], *arguments: Any) -> Any:
-    """What a user's function returns.
+    """Call a user's function, and return its result.
 
     Raises:
-        InvalidValueError: if it fails.
+        InvalidValueError: if the function fails.
     """
     try:
         return function(*arguments)
     except (RuntimeError, TypeError, ValueError, LookupError, ArithmeticError, AttributeError) as error:
-        # without the places in CasADi's sources and its lists of prototypes
+        # Remove locations in CasADi's sources, and lists of prototypes.
         reason, *_ = " ".join(str(error).split()).partition(" Possible prototypes")
         reason = re.sub(r"\S*\.[ch]pp:\d+: ?|\S*\w::\w\S* ?", "", reason)[:120]
         raise InvalidValueError(what, f"failing ({reason})", expected) from None
@@ -289,16 +290,16 @@ def call_user(what: str, expected: str, function: Callable[..., Any], *arguments
 def compute_determinant(matrix: ca.SX) -> ca.SX:
     """det A of a symbolic matrix (r, r), by cofactors, with r 2^(r-1) products.
 
-    Minors of the first k rows are made once for each choice of k columns. CasADi's own determinant makes them anew
-    everywhere, with r! products: a minute at r = 10, and nothing can interrupt it.
+    Minors of the first k rows are computed once for each choice of k columns. CasADi's own determinant repeats them,
+    with r! products: at r = 10 it takes a minute, which Ctrl-C cannot interrupt.
 
     Args:
-        matrix: with at most `MOST_ROWS` rows.
+        matrix: a matrix with at most `MOST_ROWS` rows.
     """
     rows = require_count("rows of a determinant", matrix.shape[0], least=1, most=MOST_ROWS)
     if rows <= _BY_CASADI:
         return ca.det(matrix)
-    # From row to row, each minor is expanded along its last row.
+    # Go from row to row, and expand each minor along its last row.
     minors: dict[tuple[int, ...], ca.SX] = {(): ca.SX(1)}
     for k in range(rows):
         minors = {
@@ -312,11 +313,11 @@ def compute_determinant(matrix: ca.SX) -> ca.SX:
 
 
 def wrap_shortest(difference: Any, turns: Array) -> Any:
-    """Differences without whole periods of the components that have one, each by the shorter way around.
+    """Remove whole periods from differences of periodic components, so that each is the shorter way around.
 
     Args:
         difference: NumPy rows (N, k) or (k,), or a CasADi column (k, 1).
-        turns: periods of the components, (k,); 0 for those that have none.
+        turns: periods of the components, (k,); 0 for components without a period.
     """
     if not turns.any():
         return difference

@@ -1,4 +1,4 @@
-"""Files that appear whole or not at all: drafts, replacement, the mark of files of ours; and tables of numbers."""
+"""Files that appear complete or not at all, protection of users' files, and tables of numbers."""
 
 import csv
 import errno
@@ -23,7 +23,7 @@ from orthocas.tools.checks import Array
 from orthocas.tools.interrupts import deferred
 
 LIST = ".orthocas.json"
-#: a process id means nothing on other hosts
+#: name of this host, because a process id is meaningless on other hosts
 _HOST = re.sub(r"[^A-Za-z0-9]", "", socket.gethostname())[:32] or "host"
 _NAME = re.compile(r"\.?orthocas-(?P<host>[A-Za-z0-9]+)-(?P<process>\d+)-\w+")
 _FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
@@ -31,31 +31,31 @@ _FULL = (errno.ENOSPC, errno.EFBIG, errno.EDQUOT)
 
 @dataclass(frozen=True, slots=True)
 class FileRules:
-    """Bounds of what is read."""
+    """Limits for reading files."""
 
-    header: int = 2**26  #: bytes of the header of an archive; charts may have thousands of terms on tape
-    table: int = 2**25  #: bytes of a table
-    largest: float = 1e6  #: of the numbers of a table; larger ones are mistakes
-    cell: int = 60  #: characters of a cell in an error
+    header: int = 2**26  #: largest header of an archive [bytes]; charts may have thousands of terms on tape
+    table: int = 2**25  #: largest table [bytes]
+    largest: float = 1e6  #: largest number in a table; larger ones are mistakes
+    cell: int = 60  #: most characters of a cell in an error message
 
 
 RULES = FileRules()
 
 
 def require_replaceable(path: Path, ours: bool, force: bool, error: type[ArchiveError] = ArchiveError) -> None:
-    """Refuse to replace what somebody else wrote.
+    """Refuse to replace a file that orthocas did not write.
 
     Args:
-        path: what is to be written.
-        ours: whether a file there is known as one that orthocas wrote.
-        force: replace it anyway.
+        path: path of the new file.
+        ours: whether an existing file is known to come from orthocas.
+        force: replace any file.
         error: class of the error.
 
     Raises:
-        ArchiveError: if the file is neither ours nor empty, or a symbolic link.
+        ArchiveError: if the existing file is neither ours nor empty, or is a symbolic link.
     """
     if path.is_symlink():
-        raise error(f"cannot write {path}: it is a symbolic link, expected a file name that is free or a file")
+        raise error(f"cannot write {path}: it is a symbolic link, expected a new name or a regular file")
     if path.is_file() and not (ours or force) and path.stat().st_size > 0:
         raise error(
             f"cannot write {path}: orthocas did not write the file that is there, or it was changed; "
@@ -64,11 +64,11 @@ def require_replaceable(path: Path, ours: bool, force: bool, error: type[Archive
 
 
 def is_archive(path: Path, format_name: str) -> bool:
-    """Whether a file is an archive of ours with a format, such as 'orthocas-chart', damaged or not."""
+    """Whether a file is one of our archives with a format, such as 'orthocas-chart'; it may be damaged."""
     try:
         with zipfile.ZipFile(path) as archive, archive.open("header.json") as header:
             return bool(json.loads(header.read(RULES.header))["format"] == format_name)
-    # Zipfile, its decompressors and json raise many kinds; a file that is not read is not ours.
+    # zipfile, its decompressors and json raise many kinds of errors. A file that cannot be read is not ours.
     except Exception:
         return False
 
@@ -83,7 +83,7 @@ def is_numpy_archive(path: Path, names: Iterable[str]) -> bool:
 
 
 def is_listed(path: Path) -> bool:
-    """Whether the list of its folder has a file, as it is now."""
+    """Whether the list of its folder has a file with its present checksum."""
     try:
         return path.is_file() and compute_digest(path) in read_list(path.parent).get(path.name, [])
     except OSError:
@@ -91,7 +91,7 @@ def is_listed(path: Path) -> bool:
 
 
 def read_list(folder: Path) -> dict[str, list[str]]:
-    """Names of files that were written to a folder, and the checksums that each may have."""
+    """The list of files written to a folder, with their possible checksums."""
     try:
         listed = json.loads((folder / LIST).read_text(encoding="utf-8"))["files"]
         return {str(name): [str(entry) for entry in entries] for name, entries in listed.items()}
@@ -100,7 +100,7 @@ def read_list(folder: Path) -> dict[str, list[str]]:
 
 
 def write_list(folder: Path, drafts: Iterable[Path]) -> str:
-    """The list of a folder once these drafts are there; what they replace stays known, should that never happen."""
+    """The new list of a folder for these drafts; it keeps old checksums in case the drafts never arrive."""
     files = read_list(folder)
     for draft in drafts:
         now = folder / draft.name
@@ -109,15 +109,15 @@ def write_list(folder: Path, drafts: Iterable[Path]) -> str:
 
 
 def refuse_xml(path: Path, what: str, error: type[ArchiveError]) -> None:
-    """Say that a file of another kind than expected is XML, if it is: robot files are mistaken for charts.
+    """Raise an error if a file of another expected kind is XML, because robot files are often mistaken for charts.
 
     Raises:
-        ArchiveError: the one given, if the file begins as XML does.
+        ArchiveError: if the file begins like XML. Its class is `error`.
     """
     with path.open("rb") as stream:
         begin = stream.read(200).removeprefix(b"\xef\xbb\xbf").lstrip()
     if begin.startswith((b"<?xml", b"<robot", b"<mujoco", b"<!--")):
-        raise error(f"{path} is an XML file, such as of a robot (Robot.from_file), not {what}")
+        raise error(f"{path} is an XML file, perhaps of a robot (Robot.from_file), expected {what}")
 
 
 def compute_digest(path: Path) -> str:
@@ -128,16 +128,16 @@ def compute_digest(path: Path) -> str:
 
 @contextmanager
 def open_draft_folder(parent: Path | None = None) -> Iterator[Path]:
-    """A hidden folder in `parent`, or one where the system keeps temporary files, for the time of the block.
+    """A hidden folder in `parent` or in the system's temporary folder, which exists during this context.
 
-    Its name holds host and process id. Those that processes left which no longer run are removed first.
+    Its name contains host and process id. Folders of processes that have ended are removed first.
     """
     place = Path(tempfile.gettempdir()) if parent is None else parent
     remove_drafts(place)
     prefix = f"{'' if parent is None else '.'}orthocas-{_HOST}-{os.getpid()}-"
     folder: str | None = None
     try:
-        # Ctrl-C between the folder and its name would leave the folder, and during the removal half of it.
+        # Ctrl-C must not interrupt between creation and bookkeeping, or during the removal.
         with deferred():
             folder = tempfile.mkdtemp(dir=place, prefix=prefix)
         yield Path(folder)
@@ -160,8 +160,8 @@ def write_temporary(file: Path, content: bytes) -> None:
 
 
 def remove_drafts(folder: Path) -> None:
-    """Remove the drafts of processes of this machine that no longer run."""
-    # A folder that cannot be listed or changed fails elsewhere, with a message.
+    """Remove the drafts of processes on this machine that have ended."""
+    # A folder that cannot be listed or changed causes an error elsewhere.
     with suppress(OSError):
         for entry in list(os.scandir(folder)):
             parts = _NAME.fullmatch(entry.name)
@@ -171,26 +171,26 @@ def remove_drafts(folder: Path) -> None:
                 os.kill(int(parts["process"]), 0)
             except (ProcessLookupError, OverflowError):
                 shutil.rmtree(entry.path, ignore_errors=True)
-            # Other errors say that it runs for another user.
+            # Other errors mean that the process runs under another user.
             except OSError:
                 pass
 
 
 @contextmanager
 def publish(folder: Path, listed: bool = False, force: bool = False) -> Iterator[Path]:
-    """A draft folder. Its files move to `folder` when the block ends, and are deleted if the block raises.
+    """A draft folder, whose files move to `folder` at the end of the context; after an exception they are deleted.
 
-    Each file appears whole or not at all: its content is on disk before its name is. Files of the same name are
-    replaced.
+    Each file appears complete or not at all, because its content is on disk before it gets its name. It replaces a file
+    of the same name.
 
     Args:
-        folder: where the files go.
-        listed: keep a list there of what was written, and replace only files on it (`orthocas.tools.files`).
-        force: replace others too.
+        folder: destination of the files.
+        listed: keep a list of written files there, and replace only files on this list (`orthocas.tools.files`).
+        force: replace other files too.
 
     Raises:
-        ArchiveError: if files are listed and one in the way is not, or the disk is full; or if a symbolic link is in
-            the way.
+        ArchiveError: if `listed` is set and an existing file is not on the list, if the disk is full, or if a symbolic
+            link has the name of a file.
     """
     with open_draft_folder(folder) as drafts, _name_full_disk(folder, drafts) if listed else nullcontext():
         yield drafts
@@ -199,7 +199,7 @@ def publish(folder: Path, listed: bool = False, force: bool = False) -> Iterator
             require_replaceable(folder / file.name, not listed or is_listed(folder / file.name), force)
         if listed:
             text = write_list(folder, files)
-            # The list comes first: what it announces may be missing, but nothing that is there unknown.
+            # Write the list first. Listed files may then be missing, but no file is ever unlisted.
             files.insert(0, drafts / LIST)
             files[0].write_text(text, encoding="utf-8")
         for file in files:
@@ -211,10 +211,10 @@ def publish(folder: Path, listed: bool = False, force: bool = False) -> Iterator
 
 @contextmanager
 def _name_full_disk(folder: Path, drafts: Path) -> Iterator[None]:
-    """Say which file did not fit: libraries that draw and save leave its name out.
+    """Name the file that did not fit on the disk, because libraries that draw and save do not.
 
     Raises:
-        ArchiveError: if the disk, or what the user may write, is full.
+        ArchiveError: if the disk or the user's quota is full.
     """
     try:
         yield
@@ -227,10 +227,10 @@ def _name_full_disk(folder: Path, drafts: Path) -> Iterator[None]:
 
 
 def require_replaceable_files(folder: Path, names: Iterable[str], force: bool) -> None:
-    """Check before long work that these names are free, or belong to files that orthocas wrote.
+    """Check, before long work, that these names are free or belong to files that orthocas wrote.
 
     Raises:
-        ArchiveError: if there is one, or a symbolic link.
+        ArchiveError: if a name belongs to another file or to a symbolic link.
     """
     for name in names:
         require_replaceable(folder / name, is_listed(folder / name), force)
@@ -245,13 +245,13 @@ def require_writable(path: Path, error_type: type[ArchiveError] = ArchiveError) 
     try:
         if not path.parent.is_dir():
             raise error_type(f"cannot write {path}: folder {path.parent} does not exist")
-        # drafts of processes that died
+        # Remove drafts of ended processes.
         remove_drafts(path.parent)
         if path.is_dir():
             raise error_type(f"cannot write {path}: it is a folder, expected a file name")
         if path.exists() and not (path.is_file() and os.access(path, os.W_OK)):
             raise error_type(f"cannot write {path}: it is not a writable file")
-        # permissions do not tell everything, a file does
+        # Permissions do not tell everything, so try to create a file.
         with tempfile.TemporaryFile(dir=path.parent):
             pass
     except OSError as error:
@@ -259,10 +259,10 @@ def require_writable(path: Path, error_type: type[ArchiveError] = ArchiveError) 
 
 
 def make_folder(name: str, out: str | Path, mode: int = 0o777) -> Path:
-    """Create the output folder if needed, with these rights less the umask; check that files can be written there.
+    """Create the output folder if needed, with mode `mode` less the umask, and check that it is writable.
 
     Raises:
-        InvalidValueError: if they cannot. The message names the argument `name`.
+        InvalidValueError: if this fails. The message names the argument `name`.
     """
     folder = Path(out)
     try:
@@ -277,14 +277,14 @@ def make_folder(name: str, out: str | Path, mode: int = 0o777) -> Path:
 
 @contextmanager
 def open_output_folder(name: str, out: str | Path) -> Iterator[Path]:
-    """`make_folder` for the time of a block; at its end, folders that it made and that stayed empty go away again."""
+    """`make_folder` as a context; at its end, folders that it created are removed if they are empty."""
     folder = Path(out)
     new = [place for place in (folder, *folder.parents) if not place.exists()]
     try:
         yield make_folder(name, folder)
     finally:
         for place in new:
-            # A folder that is not empty stays.
+            # A folder with files stays.
             with suppress(OSError):
                 place.rmdir()
 
@@ -298,21 +298,21 @@ def read_table(
     least: int = 2,
     largest: float = RULES.largest,
 ) -> Array:
-    """The chosen columns of a table, in their order, (N, k). Cells of others may hold anything.
+    """Read the chosen columns of a table, in the given order, (N, k). Other columns may hold anything.
 
     Args:
         path: the file.
-        what: what it is, for errors, such as "path file".
-        rows: what its rows are, such as "waypoints".
+        what: kind of file for errors, such as "path file".
+        rows: meaning of the rows, such as "waypoints".
         most: largest number of rows.
-        columns: takes the names of the header, and returns the indices of the columns; raises ValueError for others.
+        columns: maps the names in the header to the indices of the columns; raises ValueError for other headers.
         least: smallest number of rows.
-        largest: of the numbers; larger ones are mistakes.
+        largest: largest number; larger ones are mistakes.
 
     Raises:
-        PathFileError: names the file, the line, and what is wrong there.
+        PathFileError: names the file, the line and the error.
     """
-    # The number of rows first: a file of another kind should say so, not complain of its first cell.
+    # Check the number of rows first, so that a file of another kind gives a clear error.
     lines = _read_lines(Path(path), what)
     if not least <= len(lines) - 1 <= most:
         unnamed = lines and all(_is_number(cell) for cell in lines[0][1])
@@ -336,7 +336,7 @@ def _is_number(cell: str) -> bool:
 
 
 def find_columns(names: Sequence[str], columns: Sequence[str]) -> list[int]:
-    """Where the wanted names stand in a header, for `read_table`; every one has to be there once."""
+    """Indices of the given names in a header, for `read_table`. Each name must occur exactly once."""
     for name in columns:
         if name not in names:
             raise ValueError(f"line 1: column {name[: RULES.cell]!r} is missing, expected {', '.join(columns)}")
@@ -346,7 +346,7 @@ def find_columns(names: Sequence[str], columns: Sequence[str]) -> list[int]:
 
 
 def _read_lines(path: Path, what: str) -> list[tuple[int, list[str]]]:
-    """The lines that are not empty, with their numbers."""
+    """Non-empty lines with their numbers."""
     try:
         with path.open("rb") as stream:
             content = stream.read(RULES.table + 1)
@@ -356,16 +356,16 @@ def _read_lines(path: Path, what: str) -> list[tuple[int, list[str]]]:
         return [(reader.line_num, row) for row in reader if any(cell.strip() for cell in row)]
     except OSError as error:
         raise PathFileError(f"{what} {path}: cannot be read, {error.strerror}") from None
-    # ValueError also stands for bytes that are no text.
+    # ValueError: bytes that are not text.
     except (ValueError, csv.Error) as error:
-        raise PathFileError(f"{what} {path}: no CSV text, {str(error)[: RULES.cell]}") from None
+        raise PathFileError(f"{what} {path}: not CSV text, {str(error)[: RULES.cell]}") from None
 
 
 def _parse_row(
     line: int, cells: Sequence[str], header: Sequence[str], chosen: Sequence[int], largest: float
 ) -> list[float]:
     """The numbers of the chosen columns of a line."""
-    # Columns that nobody reads may hold anything, but none may be missing.
+    # Unused columns may hold anything, but must be present.
     if len(cells) != len(header):
         raise ValueError(f"line {line}: {len(cells)} numbers, expected {len(header)} as in the header")
     values = []

@@ -1,14 +1,14 @@
-"""Signals while compiled code runs: recorded at once, and raised where Python can handle them.
+"""Signals during compiled code: recorded first, and raised when Python can handle them.
 
-An exception cannot pass through CasADi's compiled code: it comes out as another exception, or is lost. So while that
-code runs, a signal is only recorded. When the code returns, or earlier where `check` is called, Ctrl-C becomes
-KeyboardInterrupt, and the signals of `ended_in_order` become SystemExit.
+An exception cannot pass through CasADi's compiled code: it becomes another exception, or is lost. So a signal during
+that code is only recorded. When the code returns, or when `check` is called, Ctrl-C becomes KeyboardInterrupt, and the
+signals of `ended_in_order` become SystemExit.
 
-Some of CasADi's Python swallows exceptions of all kinds (`except: pass` in `vertcat` and others). A command line or
-a fit that remembers signals (`remembered`, `ended_in_order`) ends as interrupted all the same.
+Some of CasADi's Python code swallows exceptions of all kinds (`except: pass` in `vertcat` and others). A command line
+or a fit that remembers signals (`remembered`, `ended_in_order`) still ends as interrupted.
 """
 
-# what `signal` wraps: its wrappers look for enums, which takes most of the time of `deferred`
+# Use the C module behind `signal`, whose wrappers convert to enums and would take most of the time of `deferred`.
 import _signal  # type: ignore[import-not-found]
 import signal
 import sys
@@ -18,33 +18,35 @@ from contextlib import contextmanager
 from types import FrameType
 from typing import Any, NoReturn
 
-INTERRUPTED = 130  #: exit code of commands after Ctrl-C, as shells have it
+INTERRUPTED = 130  #: exit code of commands after Ctrl-C, as in shells
 _ENDING = tuple(getattr(signal, name) for name in ("SIGTERM", "SIGHUP") if hasattr(signal, name))
 
 
 class _Note:
-    """The signal that came during one `deferred` of the main thread."""
+    """The signal received during one `deferred` context of the main thread."""
 
     number: int | None = None
 
     def take(self, number: int, frame: FrameType | None) -> None:
-        """The handler meanwhile; the first signal counts."""
+        """Signal handler that records the first signal."""
         self.number = self.number or number
 
 
 _notes: list[_Note] = []
-_memories: list[_Note] = []  # of `remembered`
-_ends: list[_Note] = []  # of `ended_in_order`
+# Notes of active `remembered` contexts.
+_memories: list[_Note] = []
+# Notes of active `ended_in_order` contexts.
+_ends: list[_Note] = []
 
 
 @contextmanager
 def deferred() -> Iterator[None]:
-    """Hold signals back until the end of the block. Only the main thread gets them, so other threads do nothing."""
+    """Delay signals until the end of the context. Only the main thread gets signals, so others do nothing."""
     if threading.current_thread() is not threading.main_thread():
         yield
         return
     note = _Note()
-    # Others are not held; asking takes its time.
+    # Ask only for handlers of signals that are delayed, because this takes time.
     numbers = (signal.SIGINT, *_ENDING) if _ends else (signal.SIGINT,)
     handlers = {number: _signal.getsignal(number) for number in numbers}
     before = {number: handler for number, handler in handlers.items() if _held(number, handler)}
@@ -58,15 +60,15 @@ def deferred() -> Iterator[None]:
         for number, handler in before.items():
             _signal.signal(number, handler)
         if note.number is not None:
-            # Compiled code around this one may not pass the exception on.
+            # Inform outer contexts too, because their compiled code may lose the exception.
             for outer in _notes:
                 outer.number = outer.number or note.number
-            # Also instead of what compiled code made of it.
+            # Raise the signal even if compiled code has raised another error.
             _raise(note.number)
 
 
 def check() -> None:
-    """Raise what is being held back; for code that compiled code calls."""
+    """Raise a delayed signal; for Python code that compiled code calls."""
     if threading.current_thread() is threading.main_thread():
         for note in _notes:
             if note.number is not None:
@@ -75,20 +77,20 @@ def check() -> None:
 
 @contextmanager
 def ended_in_order() -> Iterator[Callable[[], int]]:
-    """Turn SIGTERM and SIGHUP into SystemExit with 128 + their number, so that drafts go away; for command lines.
+    """Turn SIGTERM and SIGHUP into SystemExit with code 128 + number, so that drafts are removed; for command lines.
 
-    Signals that the program ignores stay ignored, as under nohup. The value is a function that returns that exit code
-    if one has come, even if its exception got lost, else 0. Python says nothing of exceptions of signals that it loses
-    itself, in callbacks of weak references.
+    Signals that the program ignores stay ignored, as under nohup. The context yields a function that returns this exit
+    code if a signal was received (even if its exception was lost), otherwise 0. Python's complaints about exceptions of
+    signals lost in callbacks of weak references are suppressed.
     """
-    # Handlers of the program's own stay.
+    # Keep handlers that the program has installed.
     memory = _Note()
     _ends.append(memory)
     before = {number: signal.getsignal(number) for number in _ENDING}
     for number, handler in before.items():
         if handler is signal.SIG_DFL:
             signal.signal(number, _end)
-    # Exceptions of signals that Python loses are remembered, and need no complaint.
+    # Exceptions of signals that Python loses are remembered, so suppress the complaint.
     complain = sys.unraisablehook
 
     def complain_of_others(lost: Any) -> None:
@@ -107,15 +109,15 @@ def ended_in_order() -> Iterator[Callable[[], int]]:
 
 @contextmanager
 def remembered() -> Iterator[Callable[[], bool]]:
-    """A function that returns whether Ctrl-C has come during the block, even if its exception got lost.
+    """Yield a function that returns whether Ctrl-C was received in this context, even if its exception was lost.
 
-    Where something other than Python's own handler is in charge, it reports only what compiled code held back. Other
-    threads than the main one get no signals.
+    If another handler than Python's default is installed, only signals delayed by compiled code are known. Threads
+    other than the main one receive no signals.
     """
     if threading.current_thread() is not threading.main_thread():
         yield lambda: False
         return
-    # Python's own handler would raise an exception that compiled code may swallow; ours also notes it.
+    # Python's default handler raises an exception that compiled code may swallow, so install one that also records it.
     memory, before = _Note(), signal.getsignal(signal.SIGINT)
     _memories.append(memory)
     if before is signal.default_int_handler:
@@ -128,7 +130,7 @@ def remembered() -> Iterator[Callable[[], bool]]:
 
 
 def check_remembered() -> None:
-    """Raise what came during the innermost `ended_in_order` or `remembered` block and got lost; for long loops."""
+    """Raise a lost signal of the innermost `ended_in_order` or `remembered` context; for long loops."""
     if threading.current_thread() is threading.main_thread():
         for memories in (_ends, _memories):
             if memories and (number := memories[-1].number) is not None:
@@ -137,13 +139,13 @@ def check_remembered() -> None:
 
 def _end(number: int, frame: FrameType | None) -> NoReturn:
     for each in _ENDING:
-        # The end is not to be disturbed.
+        # Ignore further signals while the program ends.
         signal.signal(each, signal.SIG_IGN)
     _raise(number)
 
 
 def _held(number: int, handler: object) -> bool:
-    """Whether a signal would raise something: Ctrl-C unless it is ignored, others inside `ended_in_order`."""
+    """Whether a signal would raise an exception: Ctrl-C unless ignored, others inside `ended_in_order`."""
     ours = handler is _end or isinstance(getattr(handler, "__self__", None), _Note)
     return callable(handler) if number == signal.SIGINT else ours
 

@@ -1,4 +1,4 @@
-"""JSON of results, and strict reading of JSON."""
+"""JSON of results, and strict parsing of JSON."""
 
 import json
 import math
@@ -16,7 +16,7 @@ _KINDS: dict[type, str] = {dict: "an object", list: "a list", str: "text"}
 
 
 def clean(value: Any) -> Any:
-    """Convert records and arrays as `convert` does, and numbers that are not finite to None, at all levels."""
+    """Convert records and arrays like `convert`, and non-finite numbers to None, at all levels."""
     data = convert(value)
     if isinstance(data, dict):
         return {key: clean(item) for key, item in data.items()}
@@ -26,7 +26,7 @@ def clean(value: Any) -> Any:
 
 
 def convert(value: Any) -> Any:
-    """Convert arrays and tuples to lists, and records to objects: by their own `as_dict`, or with all their fields."""
+    """Convert arrays and tuples to lists, and records to objects by their `as_dict`, or else with all their fields."""
     if hasattr(value, "as_dict"):
         return value.as_dict()
     if is_dataclass(value):
@@ -39,7 +39,7 @@ def convert(value: Any) -> Any:
 
 
 def collect_attributes(record: Any, *names: str) -> dict[str, Any]:
-    """The chosen fields and properties of a record by name, for its `as_dict`; see `convert`."""
+    """Chosen fields and properties of a record by name, for its `as_dict`; see `convert`."""
     return {name: convert(getattr(record, name)) for name in names}
 
 
@@ -49,10 +49,10 @@ def write_json(data: Mapping[str, Any], indent: int | None = None) -> str:
 
 
 def read_strict_json(text: str | bytes) -> Any:
-    """Data of a file that programs wrote: finite numbers, no key twice, no halves of surrogate pairs.
+    """Parse data written by programs: finite numbers, unique keys, no unpaired surrogates.
 
     Raises:
-        ValueError: in one line, for everything else.
+        ValueError: for anything else, in one line.
     """
     try:
         data = json.loads(
@@ -69,10 +69,10 @@ def read_strict_json(text: str | bytes) -> Any:
 
 
 def get_part(data: Mapping[str, Any], name: str, kind: type[T]) -> T:
-    """A field of data that were read.
+    """A field of parsed data.
 
     Raises:
-        InvalidValueError: if it is missing, or of another kind.
+        InvalidValueError: if it is missing or of another type.
     """
     want = _KINDS.get(kind, "an array")
     if name not in data:
@@ -84,10 +84,10 @@ def get_part(data: Mapping[str, Any], name: str, kind: type[T]) -> T:
 
 
 def refuse_doubles(pairs: list[tuple[str, Any]]) -> dict[str, Any]:
-    """An object of JSON.
+    """Build a JSON object from pairs.
 
     Raises:
-        ValueError: if a key comes twice.
+        ValueError: if a key occurs twice.
     """
     data = dict(pairs)
     if len(data) < len(pairs):

@@ -1,4 +1,4 @@
-"""Figures that notebooks show inline, whatever backend matplotlib has."""
+"""Figures that notebooks show inline, with any matplotlib backend."""
 
 import io
 from typing import Any
@@ -22,7 +22,7 @@ def equal_axes(axes: Any, points: Array) -> None:
     """Use the same scale on all three axes, around the points. A planar arm is drawn from above."""
     low, high = points.min(axis=0), points.max(axis=0)
     half = (high - low).max() / 2 * 1.05
-    # A cube around the points, with small labels.
+    # Use a cube around the points, and small labels.
     for name, middle in zip("xyz", (low + high) / 2, strict=True):
         getattr(axes, f"set_{name}lim")(middle - half, middle + half)
         getattr(axes, f"set_{name}label")(f"{name} [m]", fontsize=8)

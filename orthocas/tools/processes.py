@@ -1,4 +1,4 @@
-"""Processes that share work: workers of this machine, and schedulers of many machines."""
+"""Processes that share work: local workers, and Dask schedulers for many machines."""
 
 import ctypes
 import logging
@@ -19,24 +19,27 @@ from typing import Any
 from orthocas.errors import ArchiveError, CompileError, SchedulerError
 from orthocas.tools.interrupts import deferred
 
-_PR_SET_PDEATHSIG = 1  # of prctl(2)
-_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3  # of mallopt(3)
-_SPAWN = get_context("spawn")  # new interpreters: forked ones inherit the locks of threads that no longer run
-ATTEMPTS = 3  #: at work whose process dies each time
+# Constant of prctl(2).
+_PR_SET_PDEATHSIG = 1
+# Constants of mallopt(3).
+_M_TRIM_THRESHOLD, _M_MMAP_THRESHOLD = -1, -3
+# Start new interpreters, because forked ones inherit locks of threads that no longer run.
+_SPAWN = get_context("spawn")
+ATTEMPTS = 3  #: attempts for work whose process dies
 _log = logging.getLogger(__name__)
 
 
 class Processes(Executor):
-    """An executor of single processes with one thread each. One that died is replaced when work is submitted to it.
+    """An executor of processes with one thread each. A process that died is replaced when work is submitted to it.
 
     Args:
         size: number of processes.
-        begin: called first in each, with the arguments; calls `begin_worker`.
-        arguments: of `begin`.
+        begin: called first in each process; it calls `begin_worker`.
+        arguments: arguments of `begin`.
 
     Raises:
         ArchiveError: if the system's shared memory is full.
-        SystemExit: in its own processes, which import a script without a main guard and would call it again.
+        SystemExit: in worker processes, if the script has no main guard, because importing it would start them again.
     """
 
     def __init__(self, size: int, begin: Callable[..., object], *arguments: object) -> None:
@@ -49,14 +52,14 @@ class Processes(Executor):
         self._pending: list[set[Future[Any]]] = [set() for _ in range(size)]
 
     def submit(self, work: Callable[..., Any], /, *arguments: Any, **named: Any) -> Future[Any]:
-        """Run `work` in the process with the least to do."""
+        """Run `work` in the process with the least work."""
         for pending in self._pending:
             pending -= {future for future in pending if future.done()}
         slot = min(range(len(self._pools)), key=lambda k: len(self._pending[k]))
         try:
             future = self._submit_to(slot, work, *arguments, **named)
         except (BrokenExecutor, BrokenPipeError):
-            # A pipe: it died before it had its arguments.
+            # A broken pipe: the process died before it received its arguments.
             _log.warning("a worker process died, killed or out of memory: another one takes its place")
             self._pools[slot].shutdown(wait=False)
             self._pools[slot] = self._build_pool()
@@ -65,7 +68,7 @@ class Processes(Executor):
         return future
 
     def shutdown(self, wait: bool = True, *, cancel_futures: bool = False) -> None:
-        """End the processes at once: what they have not handed over is lost."""
+        """End the processes at once. Unreturned results are lost."""
         for pool in self._pools:
             # A pool would wait for running work.
             for process in list((pool._processes or {}).values()):
@@ -78,13 +81,14 @@ class Processes(Executor):
 
     def _build_pool(self) -> ProcessPoolExecutor:
         try:
-            # The process of multiprocessing that frees shared memory inherits what is blocked, and outlives a hang-up.
+            # Block SIGHUP meanwhile: multiprocessing's resource tracker inherits this, and so survives a hang-up to
+            # free shared memory.
             if hasattr(signal, "SIGHUP"):
                 with _block(signal.SIGHUP):
                     resource_tracker.ensure_running()
             return ProcessPoolExecutor(1, _SPAWN, *self._begin)
         except OSError as error:
-            # It names no file.
+            # The error names no file.
             raise ArchiveError(
                 f"cannot share memory with processes: {error.strerror}, expected room in /dev/shm"
             ) from None
@@ -92,11 +96,11 @@ class Processes(Executor):
 
 @contextmanager
 def starting_workers() -> Iterator[None]:
-    """Prepare the block in which an executor starts processes, that is, around its first calls of `submit`.
+    """Context in which an executor starts processes, that is, for its first calls of `submit`.
 
-    The processes use one thread each, so that they do not compete for cores. Ctrl-C never comes there, imports
-    included. Here all signals wait until the end of the block: half a start leaves a process that nobody knows, or one
-    that complains that its input ends.
+    The processes use one thread each, so that they do not compete for cores, and they ignore Ctrl-C, even during
+    imports. In this process, all signals wait until the end of the context, because an interrupted start leaves an
+    unknown process, or one that reports a broken input.
     """
     before = os.environ.get("OMP_NUM_THREADS")
     os.environ["OMP_NUM_THREADS"] = "1"
@@ -111,18 +115,18 @@ def starting_workers() -> Iterator[None]:
 
 
 def worker_died(future: Future[Any]) -> bool:
-    """Whether the process that ran a finished future has died, here or at a Dask scheduler."""
+    """Whether the process of a finished future died, locally or at a Dask scheduler."""
     error = None if future.cancelled() else future.exception()
     return isinstance(error, BrokenExecutor) or type(error).__name__ == "KilledWorker"
 
 
 def in_order(executor: Executor, work: Callable[..., Any], *columns: Sequence[Any]) -> Iterator[Any]:
-    """Like `executor.map`, but work whose process died runs again, up to `ATTEMPTS` times."""
+    """Like `executor.map`, but work whose process died is repeated, up to `ATTEMPTS` times in total."""
     rows = list(zip(*columns, strict=True))
     futures = [executor.submit(work, *row) for row in rows]
     try:
         for k, row in enumerate(rows):
-            # results in the order of the work; what a dead process had is tried again
+            # Return results in the order of the work, and repeat the work of dead processes.
             for _ in range(ATTEMPTS - 1):
                 wait_for([futures[k]])
                 if worker_died(futures[k]):
@@ -134,10 +138,10 @@ def in_order(executor: Executor, work: Callable[..., Any], *columns: Sequence[An
 
 
 def begin_worker(parent: int) -> None:
-    """Initialise a worker process: Ctrl-C is for its parent, and it ends with it, however that comes about.
+    """Initialise a worker process: it ignores Ctrl-C, and ends when its parent ends for any reason.
 
-    On Linux the kernel sees to it at once. Elsewhere a thread waits for the parent, and ends the process as soon as
-    compiled code lets it run. A worker whose parent ends before this call ends here, after its imports.
+    On Linux, the kernel ends it at once. Elsewhere, a thread waits for the parent, and ends the process as soon as
+    compiled code lets it run. If the parent ended before this call, the worker ends here, after its imports.
 
     Args:
         parent: process id of the parent, which may have ended already.
@@ -170,10 +174,10 @@ def _block(number: signal.Signals) -> Iterator[None]:
 
 
 def run_program(command: Sequence[str]) -> str:
-    """What a compiler or a program that it made prints. Ctrl-C ends it with all that it started, as gcc does cc1.
+    """Run a compiler or a program, and return its output. Ctrl-C ends it with all its child processes.
 
     Raises:
-        CompileError: if it fails or cannot start; the message has the first lines of its complaint.
+        CompileError: if it fails or cannot start. The message has the first lines of its error output.
     """
     group, pipe = 0 if hasattr(os, "killpg") else None, subprocess.PIPE
     try:
@@ -183,7 +187,7 @@ def run_program(command: Sequence[str]) -> str:
     with started as program:
         try:
             said, complaint = program.communicate()
-        # Ctrl-C and others: the whole group ends, then the exception goes on
+        # After Ctrl-C or any other exception, end the whole process group.
         except BaseException:
             if group is not None:
                 os.killpg(program.pid, signal.SIGKILL)
@@ -210,7 +214,7 @@ def scheduler_executor(address: str) -> Iterator[Executor]:
         client = distributed.Client(address, timeout="10s")
     except (OSError, ValueError, TimeoutError) as error:
         raise SchedulerError(f"the scheduler {address} does not answer: {error}") from None
-    # Jobs are new ones, so Dask need not compare their arguments: a digest of them takes longer than sending them.
+    # Mark jobs as new, because Dask's comparison of arguments by digests takes longer than sending them.
     with client:
         client.register_worker_callbacks(setup=keep_freed_memory)
         executor: Executor = client.get_executor(pure=False)
@@ -218,14 +222,15 @@ def scheduler_executor(address: str) -> Iterator[Executor]:
 
 
 def keep_freed_memory() -> None:
-    """Let this process keep up to a gigabyte of what it frees.
+    """Let this process keep up to a gigabyte of freed memory.
 
-    Workers of Dask start with MALLOC_TRIM_THRESHOLD_ = 65536: glibc gives freed arrays back to the system, and takes
-    them from it again for the next ones, which was half of the processor time of a proof.
+    Dask workers start with MALLOC_TRIM_THRESHOLD_ = 65536. With it, glibc returns freed arrays to the system and
+    requests them again for the next arrays, which took half the processor time of a proof.
     """
     if sys.platform == "linux":
-        with suppress(AttributeError):  # another C library than glibc
+        # The C library may not be glibc.
+        with suppress(AttributeError):
             library = ctypes.CDLL(None)
             library.mallopt(_M_TRIM_THRESHOLD, 2**30)
-            # Larger arrays are mapped one by one in any case.
+            # Arrays above this size are mapped one by one in any case.
             library.mallopt(_M_MMAP_THRESHOLD, 2**25)

@@ -1,4 +1,4 @@
-"""Progress of long calls: what solvers report, and how it is shown in notebooks and terminals."""
+"""Progress of long calls: reports of solvers, and bars in notebooks and terminals."""
 
 from __future__ import annotations
 
@@ -11,8 +11,9 @@ from dataclasses import dataclass
 from importlib import import_module
 from typing import Any, TextIO
 
-_PAUSE = 0.1  # [s] between pictures in notebooks
-_KERNELS = ("ZMQInteractiveShell", "Shell")  #: of Jupyter and Colab
+# [s] between updates in notebooks.
+_PAUSE = 0.1
+_KERNELS = ("ZMQInteractiveShell", "Shell")  #: kernels of Jupyter and Colab
 
 
 @dataclass(frozen=True)
@@ -22,7 +23,7 @@ class Progress:
     stage: str
     fraction: float  #: completed fraction of the stage, 0 to 1
     detail: str
-    value: float = float("nan")  #: current loss; NaN before there is one
+    value: float = float("nan")  #: current loss; NaN if there is none yet
 
 
 Monitor = Callable[[Progress], None]
@@ -48,10 +49,10 @@ UNWATCHED = Watch()
 
 
 def progress() -> Monitor:
-    """A monitor that draws: `oc.fit(problem, monitor=oc.progress())`.
+    """A monitor that draws progress bars: `oc.fit(problem, monitor=oc.progress())`.
 
-    In a Jupyter notebook it shows one bar for each stage below the cell, in a terminal one line for each stage on
-    standard error, and elsewhere nothing. It needs no widgets. Use a new one for each call.
+    In a Jupyter notebook it shows one bar per stage below the cell, in a terminal one line per stage on standard error,
+    and elsewhere nothing. It needs no widgets. Use a new monitor for each call.
 
     Example:
         >>> import orthocas as oc
@@ -70,7 +71,7 @@ def in_notebook() -> bool:
 
 
 class NotebookBars:
-    """Bars as HTML that are redrawn in place."""
+    """HTML progress bars that are redrawn in place."""
 
     def __init__(self) -> None:
         self._display = import_module("IPython.display")
@@ -79,8 +80,8 @@ class NotebookBars:
         self._drawn = 0.0
 
     def __call__(self, progress: Progress) -> None:
-        """Draw, at most ten times a second."""
-        # Redraw for new stages and at their ends, otherwise not too often.
+        """Draw a report, at most ten times a second."""
+        # Redraw at the start and the end of a stage, and otherwise at intervals.
         new = progress.stage not in self._stages
         self._stages[progress.stage] = progress
         if not new and progress.fraction < 1 and time.monotonic() < self._drawn + _PAUSE:
@@ -94,7 +95,7 @@ class NotebookBars:
 
 
 class TerminalBars:
-    """One bar of rich for each stage. It ends with its stage, by `close`, or when nothing refers to this monitor.
+    """One bar of rich per stage. It ends with its stage, by `close`, or when this monitor is deleted.
 
     Args:
         stream: a terminal.
@@ -110,7 +111,7 @@ class TerminalBars:
     def __call__(self, progress: Progress) -> None:
         """Show a report."""
         if self._stop is None or progress.stage != self._stage:
-            # The stage before is complete.
+            # The previous stage is complete.
             if self._stop is not None:
                 self._bar.update(self._bar.task_ids[0], completed=1.0)
             self.close()
@@ -126,7 +127,8 @@ class TerminalBars:
             self._stop = None
 
     def _start(self, stage: str) -> None:
-        from rich import progress as rich  # takes longer to import than all the rest, and few processes draw bars
+        # rich takes longer to import than everything else, and few processes draw bars.
+        from rich import progress as rich
         from rich.console import Console
 
         text, detail = (

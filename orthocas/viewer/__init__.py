@@ -1,4 +1,4 @@
-"""Charts, robots and motions in the browser. Only what opens a page needs the extra `[view]`."""
+"""Charts, robots and motions in the browser. Only functions that open a page need the extra `[view]`."""
 
 from orthocas.viewer.motion import Motion, cyclic_motions
 from orthocas.viewer.view import View, export_page, view

@@ -1,6 +1,6 @@
-"""The page of a chart: sliders and a handle solved live, bars, ghosts, home, undo, a sweep, a path, a recording.
+"""The page of a chart: sliders and a handle solved live, bars, ghosts, home, undo, sweeps, paths and recordings.
 
-With collisions, solids of the scene, the nearest pair, and pairs that touch in red.
+With collisions, it also shows solids of the scene, the nearest pair, and touching pairs in red.
 """
 
 import time
@@ -33,21 +33,24 @@ _NONE = "none"
 
 
 class ChartPage:
-    """The page of a chart on a viser server; `path` has waypoints of phi (N, n), or of the task alone (N, m)."""
+    """The page of a chart on a viser server; `path` holds waypoints of phi (N, n), or of the task alone (N, m)."""
 
     def __init__(
         self, server: Any, session: Session, look: Look, collisions: Collisions | None = None, path: Array | None = None
     ) -> None:
-        # State of the page, and the thread that works for it.
+        # State of the page, and its worker thread.
         self.session = session
         self._server = server
         self._panel = ChartPanel(session.chart, session.place)
         self._loop = Loop(self._settle, self._show_failure)
         self._gesture = self._dragging = self._sweeping = False
-        self._path: Array | None = None  # waypoints to play
-        self._line: Any = None  # that shows them
-        self._recorded: list[tuple[float, Array]] | None = None  # times [s] and joints (n,), while it records
-        # The scene, with room for all that the coordinates reach, then what the user moves, then what it shows first.
+        # Waypoints to play.
+        self._path: Array | None = None
+        # Line through the waypoints.
+        self._line: Any = None
+        # Times [s] and joints (n,) while the page records.
+        self._recorded: list[tuple[float, Array]] | None = None
+        # Build the scene with space for the range of the coordinates, then the controls, then the first picture.
         robot = session.chart.problem.robot
         self._fans = [fan_along(session.chart, session.home, k) for k in range(session.chart.r)]
         self._arm, self._ghosts = Arm(server.scene, "/arm", robot, look), Ghosts(server.scene, robot)
@@ -68,15 +71,15 @@ class ChartPage:
         return self.session.chart
 
     def close(self) -> None:
-        """End the thread of the page."""
+        """Stop the thread of the page."""
         self._loop.stop()
 
     def _add_sliders(self) -> dict[str, Any]:
-        """One slider for each component of phi: coordinates first."""
+        """One slider for each component of phi, coordinates first."""
         gui, chart, m = self._server.gui, self._chart, self._chart.m
         phi, sizes = chart.phi(self.session.home), chart.parts.phi_sizes
         sliders = {}
-        # Coordinates move within half a unit at first; `_settle` gives them the range that they have.
+        # Sliders of coordinates start with half a unit on each side; `_settle` sets their true range.
         with gui.add_folder("Coordinates: the task stays"):
             names = chart.parts.named_coordinates
             for label, name, value in zip(chart.labels[m:], names, phi[m:].tolist(), strict=True):
@@ -97,7 +100,7 @@ class ChartPage:
         what = label or name
 
         async def moved(event: Any) -> None:
-            # Otherwise the page itself moved it.
+            # Events without a client come from the page itself.
             if event.client is not None:
                 value = float(event.target.value)
                 self._loop.ask(what, lambda: self._move_towards({what: value}))
@@ -116,7 +119,7 @@ class ChartPage:
 
         self._record.on_click(record)
         with gui.add_folder("What a coordinate reaches"):
-            # First the coordinate that moves the joints farthest.
+            # Select the coordinate that moves the joints farthest.
             sweeps = [self._chart.problem.robot.joint_points(fan.spread(5)) for fan in self._fans]
             widest = self._fans[int(np.argmax([np.ptp(points, axis=0).max() for points in sweeps]))].label
             labels = self._chart.labels[self._chart.m :]
@@ -134,12 +137,12 @@ class ChartPage:
         return button
 
     def _find_branches(self) -> None:
-        """Search the branches of the robot, which takes seconds, and offer those beyond a mirror."""
+        """Search the branches of the robot, which takes seconds, and offer the reachable mirror images."""
         self._search.label, self._search.disabled = "Searching ...", True
         problem = self._chart.problem
         branching = self.session.branches = branches(problem.robot, problem.task)
         self._search.remove()
-        # A button for each mirror in place of the search.
+        # Replace the search button by one button per mirror.
         with self._branches:
             for cut in branching.mirrors:
                 flip = partial(self._change, partial(self.session.flip, cut))
@@ -148,9 +151,9 @@ class ChartPage:
                 self._server.gui.add_markdown("No mirror image of this arm has the same pose of its tip.")
 
     def _add_files(self) -> None:
-        """Lists of the paths and robot files in the folder where the view began, and a button that plays a path.
+        """Lists of path files and robot files in the working folder, and a button that plays a path.
 
-        The page offers names and gets no others: what a browser sends never becomes a path of its own.
+        The page accepts only names from these lists, so a browser can never choose another path.
         """
         gui = self._server.gui
         with gui.add_folder("Files"):
@@ -162,13 +165,13 @@ class ChartPage:
             self._play = self._add_button("Play", "player-play", self._toggle_path)
 
     def _load_path(self, chosen: Any) -> None:
-        """Take the waypoints of the chosen file."""
+        """Load the waypoints of the chosen file."""
         self._rest()
         x, xi = (None, None) if chosen.value == _NONE else read_path(Path.cwd() / chosen.value, self._chart)
         self._set_path(x if x is None or xi is None else np.hstack([x, xi]))
 
     def _load_look(self, chosen: Any) -> None:
-        """Draw the links as the chosen robot file shows them, or as drums and rods."""
+        """Draw the links with the meshes of the chosen robot file, or as drums and rods."""
         robot = self._chart.robot
         shape = build_shape(robot, None if chosen.value == _NONE else Path.cwd() / chosen.value, None)
         with self._server.atomic():
@@ -180,7 +183,7 @@ class ChartPage:
             raise ViewError(f"{files}; rods stand for these links")
 
     def _set_path(self, path: Array | None) -> None:
-        """Take waypoints to play, and draw them where the task has a whole position."""
+        """Set the waypoints to play, and draw them if the task has a whole position."""
         self._path, self._play.disabled = path, path is None
         if self._line is not None:
             self._line.remove()
@@ -192,9 +195,9 @@ class ChartPage:
             self._line = self._server.scene.add_line_segments("/path", ends, RULES.path_colours[0], thickness=thickness)
 
     def _toggle_path(self) -> None:
-        """Move to the first waypoint and along the others, until something else is wished for or stops it; or end.
+        """Start or stop playing: move to the first waypoint and along the others, until another input or an obstacle.
 
-        The coordinates stay, or follow the path if it has them.
+        The coordinates stay constant, or follow the path if it contains them.
         """
         path = self._path
         if self._play.label == "Stop" or path is None:
@@ -204,7 +207,7 @@ class ChartPage:
         self._begin()
         self._play.label = "Stop"
         labels, sizes = self._chart.labels[: path.shape[1]], self._chart.parts.phi_sizes[: path.shape[1]]
-        # From here, so that the arm does not jump to the first waypoint.
+        # Start at the current position, so that the arm does not jump.
         start = self._chart.phi(self.session.q)[None, : path.shape[1]]
         along = join_waypoints(np.concatenate([start, path]), sizes)
 
@@ -221,7 +224,7 @@ class ChartPage:
         self._loop.animate(tick)
 
     def _toggle_record(self, client: Any) -> None:
-        """Begin to record the joints, or end it and send the file to the browser."""
+        """Start recording the joints, or stop and send the file to the browser."""
         recorded = self._recorded
         if recorded is None:
             self._recorded, self._record.label = [], "Stop and save"
@@ -233,13 +236,13 @@ class ChartPage:
         client.send_file_download("joints.csv", text.encode(), save_immediately=True)
 
     def _change(self, change: Callable[[], None]) -> None:
-        """Another position of the session, which ends a sweep."""
+        """Change the session's position, and stop a sweep."""
         self._rest()
         change()
         self._show()
 
     def _add_handle(self) -> Any:
-        """A handle at the tool, if the task has components of its position."""
+        """Add a handle at the tool if the task has components of its position."""
         chart = self._chart
         kind = str(chart.problem.task.recipe["kind"])
         axes = tuple(kind.startswith(("position", "pose")) and axis in chart.labels[: chart.m] for axis in "xyz")
@@ -249,7 +252,7 @@ class ChartPage:
         handle = self._server.scene.add_transform_controls(
             "/tool", scale=size, active_axes=axes, disable_rotations=True, depth_test=False, opacity=0.8
         )
-        # Axes that the task leaves free stay where they are.
+        # Axes that the task does not control stay at the tool.
         moved = [axis for axis, active in zip("xyz", axes, strict=True) if active]
 
         async def dragged(event: Any) -> None:
@@ -261,7 +264,7 @@ class ChartPage:
         return handle
 
     def _add_rings(self) -> Any:
-        """Rings that turn the tool about its own axes, if the task has its whole orientation."""
+        """Add rings that turn the tool about its own axes if the task has a whole orientation."""
         chart = self._chart
         task, robot = chart.problem.task, chart.problem.robot
         if not task.of_tip or task.turn is None or not task.turn.whole:
@@ -282,10 +285,10 @@ class ChartPage:
         return rings
 
     def _move_towards(self, values: dict[str, float]) -> None:
-        """Move towards what the user wishes, as the first or a later part of a gesture."""
+        """Move towards the values set by the user, as the first or a later event of a gesture."""
         self._rest()
         self._begin()
-        # Ghosts are those of the coordinate that moves.
+        # Show the ghosts of the coordinate that moves.
         for label in values:
             if label in self._chart.labels[self._chart.m :] and self._chosen.value not in (_NONE, label):
                 self._chosen.value = label
@@ -294,13 +297,13 @@ class ChartPage:
         self._show(moved=values)
 
     def _begin(self) -> None:
-        """At the start of a gesture, remember where it began."""
+        """Remember the position at the start of a gesture."""
         if not self._gesture:
             self.session.remember()
             self._gesture = True
 
     def _toggle_sweep(self) -> None:
-        """Move the chosen coordinate to its ends and back, until something else is wished for; or end that."""
+        """Start or stop a sweep of the chosen coordinate over its range; any other input stops it too."""
         fan = self._find_fan()
         if self._sweeping or fan is None:
             self._rest()
@@ -308,7 +311,7 @@ class ChartPage:
         self._begin()
         self._sweeping, self._sweep.label = True, "Stop"
         centre, half = (fan.xi[-1] + fan.xi[0]) / 2, RULES.sweep_range * (fan.xi[-1] - fan.xi[0]) / 2
-        # A sine through the present value, over nearly the whole range.
+        # Follow a sine through the present value, over nearly the whole range.
         here = float(self.session.readings.xi[self._chart.labels.index(fan.label) - self._chart.m])
         phase = np.arcsin(np.clip((here - centre) / max(half, 1e-9), -1, 1))
 
@@ -328,13 +331,13 @@ class ChartPage:
         self._loop.animate(tick)
 
     def _rest(self) -> None:
-        """End a sweep, and a path."""
+        """Stop a sweep or a path."""
         self._loop.animate(None)
         self._sweeping, self._sweep.label = False, "Sweep"
         self._play.label = "Play"
 
     def _show(self, moved: Any = ()) -> None:
-        """Draw the arm and the readings, and move the sliders that the user does not hold."""
+        """Draw the arm and the readings, and update the sliders that the user does not hold."""
         readings = self.session.readings
         place = self.session.place
         if self._panel.place != place:
@@ -353,7 +356,7 @@ class ChartPage:
             self._undo.disabled = not self.session.can_undo
 
     def _show_arm(self, q: Array) -> None:
-        """Draw the arm and its handle, for a position of the chart (n,)."""
+        """Draw the arm and its handle at a position of the chart (n,)."""
         with self._server.atomic():
             shown = self.session.mirror(q[None])[0]
             self._arm.show(shown)
@@ -368,12 +371,12 @@ class ChartPage:
                 self._rings.wxyz = tuple(Rotation.from_matrix(robot.tip_rotation(q)).as_quat(scalar_first=True))
 
     def _settle(self) -> None:
-        """After a gesture: ranges of the sliders, the fan, and values that were not reached."""
+        """After a gesture: update slider ranges and the fan, and reset sliders of values that were not reached."""
         self._gesture = self._dragging = False
         self._fans = [fan_along(self._chart, self.session.q, k) for k in range(self._chart.r)]
         ranges = {fan.label: (float(fan.xi[0]), float(fan.xi[-1])) for fan in self._fans}
         ranges |= {label: self.session.find_reach(k) for k, label in enumerate(self._chart.labels[: self._chart.m])}
-        # Whole steps of the sliders inside the range.
+        # Use whole slider steps inside the range.
         for label, ends in ranges.items():
             slider = self._sliders[label]
             low = np.ceil(min(ends) / RULES.slider_step) * RULES.slider_step
@@ -383,24 +386,24 @@ class ChartPage:
         self._show_chosen()
 
     def _find_fan(self) -> Fan | None:
-        """The fan of the chosen coordinate."""
+        """The fan of the chosen coordinate; None if none is chosen."""
         return next((fan for fan in self._fans if fan.label == self._chosen.value), None)
 
     def _show_chosen(self) -> None:
-        """Draw another coordinate's fan and ends."""
+        """Draw the fan and the ends of the newly chosen coordinate."""
         self._show()
         fan = self._find_fan()
         with self._server.atomic():
             if fan is None:
                 self._ghosts.hide()
                 return
-            # What the arm can have of the fan.
+            # Keep the postures of the fan that the joint limits of the arm allow.
             fans = (fan.spread(RULES.ghosts), fan.spread(4 * RULES.ghosts))
             few, many = (self.session.mirror(q[self.session.find_allowed(q)]) for q in fans)
             self._ghosts.show(few, many, [f"{fan.label} = {value:.3f}" for value in (fan.xi[0], fan.xi[-1])])
 
     def _format_ends(self) -> str:
-        """What ends the chosen coordinate, as a part of the readings; a mirrored arm ends elsewhere."""
+        """HTML about what limits the chosen coordinate; a mirrored arm has other limits."""
         fan = self._find_fan()
         if fan is None or self.session.flips:
             return ""
@@ -415,7 +418,7 @@ class ChartPage:
 
 
 class Contacts:
-    """Draws solids of the scene, the line between the nearest points, and the pair in red where it is close."""
+    """Draws solids of the scene, the line between the nearest points, and close pairs in red."""
 
     def __init__(self, scene: Any, collisions: Collisions) -> None:
         self._scene, self._collisions = scene, collisions
@@ -427,7 +430,7 @@ class Contacts:
             self._add(f"/solids/{k}", part, np.zeros(3), np.array([1.0, 0.0, 0.0, 0.0]), RULES.solid, 1.0)
 
     def show(self, q: Array) -> str:
-        """Show them at a posture (n,); returns a part of the panel."""
+        """Show contacts at a posture (n,); returns HTML for the panel."""
         found = self._collisions.distance(q)
         for node in self._nodes:
             node.remove()
@@ -468,7 +471,7 @@ def build_hull(shape: Shape) -> tuple[Array, Indices]:
 
 
 def format_nearest(found: LeastDistance) -> str:
-    """A part of the panel: the nearest pair, and how far it is."""
+    """HTML for the panel: the nearest pair and its distance."""
     if not np.isfinite(found.distance):
         return "<h4>collisions</h4>no pair is checked"
     first, second = (escape(name) for name in found.pair)

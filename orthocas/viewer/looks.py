@@ -1,4 +1,4 @@
-"""How robots look: meshes of a URDF file, or drums and rods made from the kinematic tree."""
+"""Appearance of robots: meshes of a URDF file, or drums and rods made from the kinematic tree."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -26,93 +26,94 @@ Colour = tuple[int, int, int]  #: red, green, blue, 0 to 255
 
 @dataclass(frozen=True, slots=True)
 class ViewRules:
-    """Numbers of views. Sizes without a unit are fractions of the length of the arm."""
+    """Numbers of views. Lengths without a unit are fractions of the length of the arm."""
 
-    facets: int = 16  #: around an axis
+    facets: int = 16  #: facets around an axis
     ghost_facets: int = 6
     shell: Colour = (226, 229, 233)
     joint: Colour = (72, 80, 92)
     tool: Colour = (214, 96, 20)
     rod: float = 0.042  #: radius of the first rod
     taper: float = 0.45  #: fraction of the radius that is lost on the way to the tip
-    shortest_rod: float = 0.35  #: in radii; shorter ones are left out
-    triangles: int = 20_000  #: of an arm for a picture
-    mesh_triangles: int = 500  #: of a mesh at least
-    most_triangles: int = 3_000_000  #: of all meshes, more is slow to send and to draw
-    ghosts: int = 7  #: arms of a fan
-    ghost_thickness: float = 0.32  #: fraction of the arm's
+    shortest_rod: float = 0.35  #: in radii; shorter rods are left out
+    triangles: int = 20_000  #: most triangles of an arm in a picture
+    mesh_triangles: int = 500  #: each mesh keeps at least this many triangles
+    most_triangles: int = 3_000_000  #: most triangles of all meshes; more are slow to send and to draw
+    ghosts: int = 7  #: number of arms in a fan
+    ghost_thickness: float = 0.32  #: thickness relative to the arm's
     low: Colour = (24, 92, 214)  #: colours along a coordinate
     centre: Colour = (64, 168, 116)
     high: Colour = (245, 118, 10)
     trace: float = 0.004  #: thickness of a line
-    same_place: float = 0.3  #: of two labels, over the size of what moves
+    same_place: float = 0.3  #: labels nearer than this fraction of the curve's extent are merged
 
-    most_instants: int = 1_000_000  #: of a motion in a file
-    cycle: float = 5.0  #: of a closed path [s]
+    most_instants: int = 1_000_000  #: most instants of a motion file
+    cycle: float = 5.0  #: duration of a closed path [s]
     cycle_points: int = 250
     most_cycles: int = 20
-    circle: float = 0.6  #: radius of the default path, as a fraction of how far the task moves over the domain
+    circle: float = 0.6  #: radius of the default path, as a fraction of the task's range over the domain
     smallest_circle: float = 1e-3
-    corrections: int = 2  #: of the pseudo-inverse at each point
-    same_ends: float = 1e-9  #: of closed paths, relative to the sizes of the task
+    corrections: int = 2  #: corrections of the pseudo-inverse at each point
+    same_ends: float = 1e-9  #: largest gap between the ends of a closed path, in sizes of the task
 
-    tracker_steps: int = 200  #: towards one target
-    shortest_step: float = 1e-4  #: fraction of the way to a target below which there is no way on
-    reached: float = 1e-10  #: of the sizes of the components
+    tracker_steps: int = 200  #: largest number of tracker steps towards one target
+    shortest_step: float = 1e-4  #: fraction of the way to a target below which the tracker is stuck
+    reached: float = 1e-10  #: tolerance of a target, in sizes of the components
     most_undone: int = 100
 
     small_angle: float = 0.001  #: [deg]
     slider_step: float = 1e-3
-    reach_steps: int = 8  #: of a component of the task over its size, to find how far it goes
-    missed: float = 1e-6  #: of the sizes of the components: a target that is not reached
-    reach_sizes: float = 2.0  #: of a component, beyond which nobody slides
+    reach_steps: int = 8  #: steps per size of a task component, to find its range
+    missed: float = 1e-6  #: in sizes of the components; a target missed by more is not reached
+    reach_sizes: float = 2.0  #: largest range of a slider, in sizes of the component
     endless: float = float(np.pi)  #: half of a slider without limits [rad] or [m]
-    handle: float = 0.17  #: arrows at the tool, of the length of the chain
-    rings: float = 0.13  #: that turn it
-    sweep: float = 6.0  #: there and back [s]
+    handle: float = 0.17  #: length of arrows at the tool, as a fraction of the chain's length
+    rings: float = 0.13  #: radius of rings at the tool
+    sweep: float = 6.0  #: duration of a sweep there and back [s]
     sweep_range: float = 0.97  #: fraction of the range that a sweep uses
-    most_recorded: int = 100_000  #: joint positions, about an hour
-    reading_pause: float = 0.1  #: between readings in a sweep, which take longer than a picture [s]
+    most_recorded: int = 100_000  #: most joint positions of a recording, about an hour
+    reading_pause: float = 0.1  #: [s] between readings during a sweep, because they take longer than a picture
 
-    plot_points: int = 400  #: of a line in a plot
-    #: of the lines in a plot: eight that are told apart, also by the colour-blind (Okabe and Ito)
+    plot_points: int = 400  #: points of a line in a plot
+    #: colours of lines in a plot: eight that colour-blind people can also distinguish (Okabe and Ito)
     plot_colours: tuple[str, ...] = (
         *("#0072b2", "#e69f00", "#009e73", "#cc79a7"),
         *("#d55e00", "#56b4e9", "#000000", "#b8a800"),
     )
     path_colours: tuple[Colour, ...] = ((31, 95, 168), (217, 95, 2), (27, 158, 119))
-    path_points: int = 2000  #: of a tool path, at most
-    apart: float = 0.9  #: distance of arms that are side by side
-    time_step: float = 0.01  #: of the time slider [s]
-    rate: int = 30  #: recorded pictures a second
-    recorded_sweep: float = 5.0  #: of one coordinate [s]
+    path_points: int = 2000  #: most points of a tool path
+    apart: float = 0.9  #: distance of arms side by side
+    time_step: float = 0.01  #: step of the time slider [s]
+    rate: int = 30  #: recorded pictures per second
+    recorded_sweep: float = 5.0  #: duration of the recorded sweep of one coordinate [s]
     recorded_length: float = 120.0  #: longer motions are recorded faster [s]
 
-    far_links: float = 0.3  #: [m]: a full bar
-    near_links: float = 0.1  #: [m]: amber below
-    close_links: float = 0.02  #: [m]: red below, and the pair with it
+    far_links: float = 0.3  #: distance of a full bar [m]
+    near_links: float = 0.1  #: amber below this distance [m]
+    close_links: float = 0.02  #: bar and pair red below this distance [m]
     link_line: float = 0.004  #: thickness of the line between nearest points [m]
     touching: Colour = (214, 69, 69)
     solid: Colour = (150, 158, 168)
 
     brand: Colour = (31, 95, 168)
-    panel_widths: tuple[int, int] = (320, 300)  #: of readings and sliders [px]
+    panel_widths: tuple[int, int] = (320, 300)  #: widths of the panels of readings and sliders [px]
     view_angle: float = 0.7  #: of the camera [rad]
-    room: float = 1.15  #: around the arms in the picture
-    camera_slack: float = 1e-3  #: fraction of its distance within which a camera stands where it was placed
-    camera_pause: float = 0.5  #: that a camera may be elsewhere before it is where it was placed [s]
-    flat: float = 1e-9  #: of planar arms, and no gravity
-    floor: float = 1.5  #: radius
-    fade: float = 0.5  #: where the lines of the floor begin to fade, as a fraction of its radius
-    line: float = 0.002  #: thickness of these lines
-    grid: tuple[Colour, Colour] = ((205, 210, 217), (228, 231, 235))  #: every fifth line, and the others
+    room: float = 1.15  #: margin around the arms in the picture
+    #: largest displacement of a camera that still counts as placed, as a fraction of its distance
+    camera_slack: float = 1e-3
+    camera_pause: float = 0.5  #: [s] a camera may need to reach its place
+    flat: float = 1e-9  #: extent below which an arm is planar or gravity is zero
+    floor: float = 1.5  #: radius of the floor
+    fade: float = 0.5  #: fraction of the floor's radius at which its lines begin to fade
+    line: float = 0.002  #: thickness of the floor's lines
+    grid: tuple[Colour, Colour] = ((205, 210, 217), (228, 231, 235))  #: colours of every fifth line, and of the others
 
-    tick: float = 1 / 30  #: of animations; browsers without a graphics card fall behind more [s]
-    quiet: float = 0.25  #: without jobs, after which the page settles [s]
-    silence: float = 1.0  #: of a connection that asks for nothing, before it is dropped [s]
-    most_files: int = 50  #: of a folder, that a page offers
-    largest_message: int = 2**20  #: from a browser; sliders and cameras need hundreds [bytes]
-    message_length: int = 80  #: of a report [characters]
+    tick: float = 1 / 30  #: [s] per frame of animations; without a graphics card, browsers cannot draw more often
+    quiet: float = 0.25  #: [s] without jobs before the page settles
+    silence: float = 1.0  #: [s] without a request before a connection is dropped
+    most_files: int = 50  #: most files of a folder that a page lists
+    largest_message: int = 2**20  #: largest message from a browser [bytes]; sliders and cameras need hundreds
+    message_length: int = 80  #: most characters of a message in a report
 
 
 RULES = ViewRules()
@@ -123,7 +124,7 @@ class Solid:
     """Triangles of one colour."""
 
     vertices: Array  #: (V, 3) in the frame of the body [m]
-    faces: Indices  #: (F, 3) rows of vertices, counterclockwise from outside
+    faces: Indices  #: (F, 3) indices of vertices, counterclockwise from outside
     colour: Colour
 
     def move(self, rotation: Array, translation: Array) -> "Solid":
@@ -132,7 +133,7 @@ class Solid:
 
 
 def join_solids(solids: Sequence[Solid], colour: Colour) -> Solid:
-    """All triangles of some solids as one, in one colour."""
+    """Join the triangles of several solids into one solid of one colour."""
     first = np.cumsum([0, *(len(solid.vertices) for solid in solids)])
     faces = [solid.faces + start for solid, start in zip(solids, first, strict=False)]
     return Solid(np.concatenate([solid.vertices for solid in solids]), np.concatenate(faces), colour)
@@ -141,7 +142,7 @@ def join_solids(solids: Sequence[Solid], colour: Colour) -> Solid:
 def build_capsule(
     start: Array, end: Array, radii: tuple[float, float], colour: Colour, facets: int = RULES.facets
 ) -> Solid:
-    """A rod with round ends from one point (3,) to another, with a radius at each end [m]."""
+    """A rod with round ends between two points (3,), with a radius at each end [m]."""
     length = float(np.linalg.norm(end - start))
     low = _build_arc(radii[0], -np.pi / 2, 0.0, facets)
     high = _build_arc(radii[1], 0.0, np.pi / 2, facets) + np.array([0.0, length])
@@ -150,7 +151,7 @@ def build_capsule(
 
 
 def build_drum(radius: float, half_height: float, colour: Colour, facets: int = RULES.facets) -> Solid:
-    """A cylinder with rounded edges about the z axis, with its middle at the origin."""
+    """A cylinder with rounded edges about the z axis, with its centre at the origin."""
     edge = 0.25 * min(radius, half_height)
     lower, upper = _build_arc(edge, -np.pi / 2, 0.0, facets), _build_arc(edge, 0.0, np.pi / 2, facets)
     shift = np.array([radius - edge, half_height - edge])
@@ -159,7 +160,7 @@ def build_drum(radius: float, half_height: float, colour: Colour, facets: int = 
 
 
 def build_block(size: Array, colour: Colour) -> Solid:
-    """A box of a size (3,) [m] with its middle at the origin. Faces share no vertices, so that edges look sharp."""
+    """A box of a size (3,) [m] with its centre at the origin. Faces share no vertices, so that edges look sharp."""
     vertices: list[Array] = []
     faces: list[list[int]] = []
     for axis in range(3):
@@ -184,7 +185,7 @@ def _build_arc(radius: float, start: float, end: float, facets: int) -> Array:
 
 
 def _revolve(profile: Array, colour: Colour, facets: int) -> Solid:
-    """A profile of points (r, z), from bottom to top, turned about the z axis."""
+    """Revolve a profile of points (r, z), from bottom to top, about the z axis."""
     angle = np.linspace(0.0, 2 * np.pi, facets, endpoint=False)
     r, z = profile.T
     ring = np.stack([np.outer(r, np.cos(angle)), np.outer(r, np.sin(angle)), np.outer(z, np.ones_like(angle))], axis=-1)
@@ -195,13 +196,14 @@ def _revolve(profile: Array, colour: Colour, facets: int) -> Solid:
     return Solid(ring.reshape(-1, 3), np.concatenate([lower, upper]), colour)
 
 
-Look = list[list[Solid]]  #: what each frame of `BodyPoses` carries: base, bodies, tip
+Look = list[list[Solid]]  #: solids carried by each frame of `BodyPoses`: base, bodies, tip
 
 
 def decimate(look: Look, most: int = RULES.triangles) -> Look:
-    """The same look with about so many triangles, or fewer; small solids stay as they are.
+    """The same look with at most about `most` triangles; small solids stay as they are.
 
-    By the quadric error metric (package fast-simplification, through trimesh). Without that package, all stay.
+    It uses the quadric error metric (package fast-simplification, through trimesh). Without that package, nothing
+    changes.
     """
     share = most / max(sum(len(solid.faces) for solids in look for solid in solids), 1)
     if share >= 1 or find_spec("fast_simplification") is None:
@@ -213,8 +215,9 @@ def decimate(look: Look, most: int = RULES.triangles) -> Look:
 
 
 def _decimate(solid: Solid, count: int) -> Solid:
-    """A solid with about so many triangles."""
-    import trimesh  # half a second, for meshes of robot files only
+    """Simplify a solid to about `count` triangles."""
+    # trimesh takes half a second to import, and only meshes of robot files need it.
+    import trimesh
 
     if len(solid.faces) <= count:
         return solid
@@ -223,7 +226,7 @@ def _decimate(solid: Solid, count: int) -> Solid:
 
 
 def build_stick_arm(tree: KinematicTree, thickness: float = 1.0, facets: int = RULES.facets) -> Look:
-    """Drums about the joint axes and tapered rods between the frames, thinner or thicker than usual by a factor."""
+    """Drums about the joint axes and tapered rods between the frames, with a factor on their thickness."""
     look: Look = [[] for _ in range(tree.bodies + 2)]
     # Radii of the rods that begin at the base and at each body, (N + 1,).
     total, run = compute_chain_length(tree), np.zeros(tree.bodies + 1)
@@ -232,14 +235,15 @@ def build_stick_arm(tree: KinematicTree, thickness: float = 1.0, facets: int = R
     radii = thickness * RULES.rod * total * (1 - RULES.taper * np.clip(run / total, 0.0, 1.0))
     for i, parent in enumerate(tree.parents):
         r = radii[i + 1]
-        # A drum about the axis of a revolute joint, or a slim rail along that of a prismatic one.
+        # Put a drum about the axis of a revolute joint, or a slim rail along that of a prismatic one.
         size = (0.8 * r, 2.2 * r) if tree.body_kinds[i] == "prismatic" else (1.18 * r, 1.3 * r)
         look[i + 1].append(build_drum(*size, RULES.joint, facets))
         _add_rod(look[parent + 1], tree.translations[i], (radii[parent + 1], r), facets)
     r = radii[tree.tip_parent + 1]
     _add_rod(look[tree.tip_parent + 1], tree.tip_translation, (r, 0.75 * r), facets)
     look[-1].append(build_ball(0.55 * r, RULES.tool, facets))
-    for frame in map(tree.frame, tree.tips):  # further hands
+    # The other tips.
+    for frame in map(tree.frame, tree.tips):
         r = radii[frame.parent + 1]
         _add_rod(look[frame.parent + 1], frame.translation, (r, 0.75 * r), facets)
         look[frame.parent + 1].append(build_ball(0.55 * r, RULES.tool, facets).move(np.eye(3), frame.translation))
@@ -258,21 +262,21 @@ def compute_chain_length(tree: KinematicTree) -> float:
 
 
 def _add_rod(solids: list[Solid], end: Array, radii: tuple[float, float], facets: int) -> None:
-    """A rod from the origin of a body to a point of it, unless it is hidden in the drums."""
+    """Add a rod from the origin of a body to one of its points, unless drums hide it."""
     if np.linalg.norm(end) > RULES.shortest_rod * radii[0]:
         solids.append(build_capsule(np.zeros(3), end, radii, RULES.shell, facets))
 
 
 @dataclass(frozen=True)
 class RobotLook:
-    """How a robot looks."""
+    """The appearance of a robot."""
 
-    look: Look  #: empty for bodies without anything to show
+    look: Look  #: empty lists for bodies without solids
     missing: tuple[str, ...] = ()  #: mesh files that cannot be found or read
 
 
 def build_shape(robot: Robot, robot_file: str | Path | None, locked: Mapping[str, float] | None) -> RobotLook:
-    """How a robot looks: as its file says, or drums and rods where that shows nothing."""
+    """Appearance of a robot: from its file, or drums and rods if the file shows nothing."""
     sticks = build_stick_arm(robot.tree)
     if robot_file is None:
         return RobotLook(sticks)
@@ -283,9 +287,9 @@ def build_shape(robot: Robot, robot_file: str | Path | None, locked: Mapping[str
 
 
 def read_urdf_look(path: Path, tree: KinematicTree, locked: Mapping[str, float] | None = None) -> RobotLook:
-    """Solids of all links of a URDF file, carried by the bodies of a robot that was built from it.
+    """Solids of all links of a URDF file, on the bodies of a robot that was built from it.
 
-    Joints off the chain to the tip are locked as in `Robot.from_urdf`, so their links are shown too.
+    Joints outside the chain are locked as in `Robot.from_urdf`, so their links are shown too.
 
     Args:
         path: the URDF file.
@@ -318,7 +322,7 @@ def read_urdf_look(path: Path, tree: KinematicTree, locked: Mapping[str, float] 
 
 
 def _read_colour(material: ElementTree.Element) -> Colour | None:
-    """The colour that a material defines itself."""
+    """The colour that a material element itself defines; None if it has none."""
     element = material.find("color")
     if element is None:
         return None
@@ -331,14 +335,14 @@ def _read_colour(material: ElementTree.Element) -> Colour | None:
 def _build_solid(
     path: Path, visual: ElementTree.Element, colours: Mapping[str, Colour], missing: list[str]
 ) -> Solid | None:
-    """The geometry of a visual element in its own frame; None if there is none to show."""
-    # A colour of its own, that of a named material, or the default.
+    """The geometry of a visual element in its own frame; None if it has none."""
+    # The colour is the element's own, that of a named material, or the default.
     material = visual.find("material")
     colour = RULES.shell
     if material is not None:
         colour = _read_colour(material) or colours.get(material.get("name", ""), RULES.shell)
     shape = next(iter(visual.find("geometry") if visual.find("geometry") is not None else ()), None)  # type: ignore[arg-type]
-    # Shapes as URDF files name them; others are not shown.
+    # Build the shapes of URDF; other shapes are not shown.
     if shape is None:
         return None
     if shape.tag == "box":
@@ -357,7 +361,7 @@ def _build_solid(
 
 
 class BodyPoses:
-    """Poses of the base, of each body and of the tip frame in the world: N + 2 frames in this order."""
+    """Poses in the world of the base, of each body and of the tip frame: N + 2 frames in this order."""
 
     def __init__(self, tree: KinematicTree) -> None:
         q = ca.SX.sym("q", tree.n)
@@ -375,23 +379,23 @@ class BodyPoses:
 
 
 class Arm:
-    """An arm in the scene: one skinned mesh for each colour, whose bones are the bodies.
+    """An arm in the scene: one skinned mesh for each colour, with the bodies as bones.
 
-    Without a graphics card, the time of a picture goes with the number of meshes more than with their triangles.
+    Without a graphics card, drawing time depends on the number of meshes more than on their triangles.
 
     Args:
-        scene: of a viser server.
-        name: of its node, such as "/arm".
+        scene: scene of a viser server.
+        name: name of its node, such as "/arm".
         robot: the robot.
-        look: what its bodies carry.
-        shift: where its base stands (3,) [m].
+        look: solids of its bodies.
+        shift: position of its base (3,) [m].
     """
 
     def __init__(self, scene: Any, name: str, robot: Robot, look: Look, shift: Array | None = None) -> None:
         self._poses = BodyPoses(robot.tree)
         self.shift = np.zeros(3) if shift is None else shift
         self._nodes = [scene.add_frame(name, show_axes=False, position=tuple(self.shift))]
-        # A mesh for each colour; bones are bodies, and move with them.
+        # Make one mesh per colour. Its bones are the bodies.
         self._bones: list[tuple[int, Any]] = []
         colours = dict.fromkeys(solid.colour for solids in look for solid in solids)
         for k, colour in enumerate(colours):
@@ -408,7 +412,7 @@ class Arm:
             self._bones += zip(solids, handle.bones, strict=True)
 
     def remove(self) -> None:
-        """Take it out of the scene."""
+        """Remove it from the scene."""
         for node in self._nodes:
             node.remove()
 
@@ -429,7 +433,7 @@ class Ghosts:
         self._nodes: list[Any] = []
 
     def show(self, q: Array, curve: Array, ends: Sequence[str] = ()) -> None:
-        """Show arms at joint positions (N, n), the way of their joints along a curve (M, n), and texts at its ends."""
+        """Show arms at joint positions (N, n), lines of their joints along a curve (M, n), and labels at its ends."""
         self.hide()
         positions, quaternions = self._poses(q)
         for k, colour in enumerate(compute_shades(len(q)).tolist()):
@@ -441,7 +445,7 @@ class Ghosts:
                 flat_shading=False, cast_shadow=False, receive_shadow=False,
             )  # fmt: skip
             self._nodes.append(node)
-        # Lines that the joints move along, except those that stay.
+        # Draw the lines of joints that move.
         points = self._robot.joint_points(curve)  # (M, joints, 3)
         size = float(np.ptp(points.reshape(-1, 3), axis=0).max())
         moving = points[:, np.ptp(points, axis=0).max(axis=1) > 0.03 * size]
@@ -451,7 +455,7 @@ class Ghosts:
             shade = np.stack([colours[:-1], colours[1:]], axis=2).reshape(-1, 2, 3)
             thickness = RULES.trace * max(size, 1e-3)
             self._nodes.append(self._scene.add_line_segments("/ghosts/traces", lines, shade, thickness=thickness))
-            # At the joint that moves farthest; both texts in one place if the curve comes back.
+            # Put labels at the joint that moves farthest; merge them if the curve is closed.
             way = points[:, int(np.argmax(np.linalg.norm(np.ptp(points, axis=0), axis=1)))]
             if len(ends) == 2 and np.linalg.norm(way[-1] - way[0]) < RULES.same_place * size:
                 ends, way = [f"{ends[0]} and {ends[1]}"], way[:1]
@@ -461,7 +465,7 @@ class Ghosts:
                 )
 
     def hide(self) -> None:
-        """Remove all."""
+        """Remove arms, lines and labels."""
         for node in self._nodes:
             node.remove()
         self._nodes = []

@@ -1,4 +1,4 @@
-"""Motions to play: runs, joint motions, their files, and a tool path followed in two ways."""
+"""Motions to play: runs, joint motions, their files, and a tool path followed by two methods."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -23,18 +23,18 @@ _TIME = "time_s"
 
 @dataclass(frozen=True, eq=False)
 class Motion:
-    """Joint positions over time, and quantities that belong to them."""
+    """Joint positions over time, with associated quantities."""
 
     name: str
     times: Array  #: (N,) [s], increasing
     q: Array  #: (N, n) [rad] or [m]
     labels: tuple[str, ...]  #: names of the quantities
     values: Array  #: (N, k)
-    references: Array | None = None  #: (N, k)
-    marked: NDArray[np.bool_] | None = None  #: (N,) where the controller used its fallback
-    cycles: tuple[float, ...] = ()  #: ends of the cycles of a motion that repeats a path [s]
-    commands: Array | None = None  #: (N, n) of a controller
-    kind: str = "torque"  #: of the commands, or velocity
+    references: Array | None = None  #: (N, k) references of the quantities
+    marked: NDArray[np.bool_] | None = None  #: (N,) whether the controller used its fallback
+    cycles: tuple[float, ...] = ()  #: ends of the cycles, if the motion repeats a path [s]
+    commands: Array | None = None  #: (N, n) commands of a controller
+    kind: str = "torque"  #: kind of the commands: "torque" or "velocity"
 
     def __post_init__(self) -> None:
         for name in ("times", "q", "values"):
@@ -42,7 +42,7 @@ class Motion:
 
     @classmethod
     def of_run(cls, run: Trajectory) -> "Motion":
-        """The motion of a simulated run."""
+        """Convert a simulated run."""
         return cls(
             run.controller,
             run.times,
@@ -58,7 +58,7 @@ class Motion:
 
     @classmethod
     def of_path(cls, motion: JointMotion) -> "Motion":
-        """The motion along a tool path."""
+        """Convert a motion along a tool path."""
         return cls("tool path", motion.times, motion.q, motion.labels, np.hstack([motion.x, motion.xi]))
 
     @property
@@ -67,22 +67,22 @@ class Motion:
         return float(self.times[-1] - self.times[0])
 
     def at(self, seconds: float) -> Array:
-        """The joint position (n,) some seconds after the start."""
+        """The joint position (n,) at a time after the start [s]."""
         t = self.times[0] + seconds
         return np.array([np.interp(t, self.times, column) for column in self.q.T])
 
     def index(self, seconds: float) -> int:
-        """The row of the last instant up to some seconds after the start."""
+        """The index of the last instant up to a time after the start [s]."""
         return int(np.clip(np.searchsorted(self.times, self.times[0] + seconds + 1e-9) - 1, 0, len(self.times) - 1))
 
     def returns(self, seconds: float) -> list[tuple[int, float]]:
-        """For each cycle that is over: its number, and how far a joint then is from its start at most [deg]."""
+        """For each finished cycle: its number, and the largest distance of a joint from its start [deg]."""
         over = [(k, end) for k, end in enumerate(self.cycles, 1) if end <= seconds + 1e-9]
         return [(k, float(np.degrees(np.abs(self.at(end) - self.q[0]).max()))) for k, end in over]
 
 
 def require_joints(names: tuple[str, ...], robot: Robot, what: str) -> None:
-    """Raise InvalidValueError unless a motion has the joints of a robot."""
+    """Raise InvalidValueError unless a motion has exactly the joints of a robot."""
     if names != robot.joint_names:
         raise InvalidValueError(f"joints of {what}", ", ".join(names), ", ".join(robot.joint_names))
 
@@ -91,7 +91,7 @@ def read_run(path: Path, robot: Robot) -> Motion:
     """Read a file of `orthocas simulate`.
 
     Raises:
-        TrajectoryFileError: if the file is no run.
+        TrajectoryFileError: if the file is not a run.
         InvalidValueError: if its joints are not those of the robot.
     """
     run = Trajectory.load(path)
@@ -100,17 +100,17 @@ def read_run(path: Path, robot: Robot) -> Motion:
 
 
 def read_joint_motion(path: Path, robot: Robot) -> Motion:
-    """Read a file of `orthocas follow`: a header with time_s and the names of all joints, then one row an instant.
+    """Read a file of `orthocas follow`: a header with time_s and the names of all joints, then one row per instant.
 
-    Columns for velocities and accelerations are left out; others are quantities to show. An MCAP file of rosbag2 gives
-    its JointState messages.
+    Columns of velocities and accelerations are ignored; other columns are quantities to show. In an MCAP file of
+    rosbag2, the JointState messages are read.
 
     Raises:
-        PathFileError: names the file, and what is wrong there.
+        PathFileError: names the file and the error.
     """
     if path.suffix.lower() == ".mcap":
         times, q = read_joints(path, robot)
-        # Several messages of one time count once.
+        # Keep the first of several messages with equal time.
         kept = np.append(True, np.diff(times) > 0)
         return Motion(path.stem, times[kept], q[kept], (), np.zeros((int(kept.sum()), 0)))
     header: list[str] = []
@@ -121,7 +121,7 @@ def read_joint_motion(path: Path, robot: Robot) -> Motion:
         return find_columns(names, names)
 
     table = read_table(path, "motion file", "instants", RULES.most_instants, choose_columns)
-    # Quantities are columns that are neither time, joints nor their rates.
+    # Quantities are columns other than time, joints and their rates.
     rates = {f"{order}_{name}" for order in ("d", "dd") for name in robot.joint_names}
     labels = tuple(name for name in header if name not in {_TIME, *robot.joint_names, *rates})
     times, q, values = (
@@ -134,27 +134,28 @@ def read_joint_motion(path: Path, robot: Robot) -> Motion:
 
 
 def write_joints(names: Sequence[str], times: Array, q: Array) -> str:
-    """A motion file as `read_joint_motion` reads it: times (N,) [s] from 0, and joint positions (N, n)."""
+    """Write the text of a motion file for `read_joint_motion`: times (N,) [s] from 0, and joint positions (N, n)."""
     kept = np.append(True, np.diff(times) > 0)
     rows = np.column_stack([times - times[0], q])[kept]
     lines = [",".join(f"{value:.9g}" for value in row) for row in rows.tolist()]
     return "\n".join([",".join([_TIME, *names]), *lines, ""])
 
 
-Place = Callable[[Array], Array]  #: shares of a cycle (N,) -> task values (N, m)
+Place = Callable[[Array], Array]  #: fraction of a cycle (N,) -> task values (N, m)
 
 
 def cyclic_motions(chart: Chart, path: Array | None = None, cycles: int = 3) -> tuple[Motion, Motion]:
-    """The joints along a closed tool path with constant xi, and along the same path by the pseudo-inverse.
+    """Motions along a closed tool path: the first with constant xi, the second by the pseudo-inverse.
 
-    The second takes the shortest step of the joints in each interval, q' = q + J_x^+ (x' - h(q)), corrected until the
-    tool is on the path. Both begin at the centre of the domain.
+    The second motion takes the shortest joint step in each interval, q' = q + J_x^+ (x' - h(q)), with corrections until
+    the tool is on the path. Both motions begin at the centre of the domain.
 
     Args:
         chart: a fitted chart.
-        path: task values of waypoints of a closed path (N, m), joined by straight lines; its first point should be near
-            the task value at the centre. Default: the largest of some circles there that the chart can follow.
-        cycles: how often.
+        path: task values of waypoints of a closed path (N, m), joined by straight lines. Its first point should be near
+            the task value at the centre. Default: the largest circle there, of several candidates, that the chart can
+            follow.
+        cycles: number of repetitions.
 
     Raises:
         PathError: if the path is not closed, or leaves the domain with constant xi.
@@ -162,7 +163,7 @@ def cyclic_motions(chart: Chart, path: Array | None = None, cycles: int = 3) -> 
     """
     require_kind("chart", chart, Chart)
     require_count("cycles", cycles, most=RULES.most_cycles)
-    # Instants [s], and the share of a cycle that is done: from rest to rest in each cycle.
+    # Time stamps [s], and the completed fraction of a cycle; each cycle starts and ends at rest.
     t = np.linspace(0.0, 1.0, RULES.cycle_points + 1)
     fraction = t**3 * (10 - 15 * t + 6 * t**2)
     times = RULES.cycle * np.concatenate([[0.0], *(k + t[1:] for k in range(cycles))])
@@ -171,7 +172,7 @@ def cyclic_motions(chart: Chart, path: Array | None = None, cycles: int = 3) -> 
     if path is None:
         along, q = _find_largest_circle(chart, start, fractions)
     else:
-        # A closed path, measured in the sizes of the task.
+        # The path must be closed, measured in sizes of the task.
         points, _ = as_point_set("path", path, chart.m)
         sizes = chart.parts.phi_sizes[: chart.m]
         if len(points) < 3 or np.abs((points[-1] - points[0]) / sizes).max() > RULES.same_ends:
@@ -189,8 +190,8 @@ def cyclic_motions(chart: Chart, path: Array | None = None, cycles: int = 3) -> 
 
 
 def _find_largest_circle(chart: Chart, start: Array, fractions: Array) -> tuple[Place, Array]:
-    """A circle in two of the task's first three components, or a line in one, as large as the chart can follow."""
-    # Circles that begin at the start, on either side of it in each plane; smaller ones until the chart can follow one.
+    """The largest circle in two of the task's first three components, or line in one, that the chart can follow."""
+    # Try circles through the start, on either side of it in each plane, with decreasing size.
     x0, sizes = chart.x(start), chart.parts.phi_sizes[: chart.m]
     alike = [k for k in range(min(chart.m, 3)) if chart.problem.task.units[k] == chart.problem.task.units[0]]
     sides = [(i, j, sign) for i in alike for j in alike if i != j for sign in (-1.0, 1.0)] or [(0, 0, 1.0)]
@@ -214,7 +215,7 @@ def _find_largest_circle(chart: Chart, start: Array, fractions: Array) -> tuple[
 
 
 def join_waypoints(points: Array, sizes: Array) -> Place:
-    """Straight lines between waypoints (N, k), by the share of their length in sizes (k,)."""
+    """Straight lines between waypoints (N, k), as a function of the fraction of their length in sizes (k,)."""
     lengths = np.linalg.norm(np.diff(points, axis=0) / sizes, axis=1)
     if not lengths.sum() > 0:
         raise InvalidValueError("path", "one point", "waypoints at different places")
@@ -223,8 +224,8 @@ def join_waypoints(points: Array, sizes: Array) -> Place:
 
 
 def _follow_with_constant_xi(chart: Chart, x: Array, start: Array) -> Array:
-    """Joint positions (N, n) with task values x (N, m) and the coordinates of the start."""
-    # Begin at the first point, and track the others.
+    """Joint positions (N, n) with task values x (N, m) and the xi of the start."""
+    # Solve for the first point, and track the others.
     xi = chart.xi(start)
     q = chart.solve(np.concatenate([x[0], xi]), start).require(inside=True).q[0]
     tracker = chart.tracker(q)
@@ -239,7 +240,7 @@ def _follow_with_constant_xi(chart: Chart, x: Array, start: Array) -> Array:
 
 
 def _follow_by_pseudo_inverse(chart: Chart, x: Array, start: Array) -> Array:
-    """Joint positions (N, n) with task values x (N, m), each by the shortest step from the one before."""
+    """Joint positions (N, n) with task values x (N, m), each by the shortest step from the previous one."""
     task, q = chart.problem.task, start
     positions = np.empty((len(x), chart.n))
     for k, value in enumerate(x):

@@ -1,4 +1,4 @@
-"""Readings of a joint position as a small page of HTML: numbers and bars."""
+"""Readings at a joint position as a small HTML page with numbers and bars."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
@@ -34,22 +34,22 @@ padding:8px 10px;margin-top:10px}
 
 @dataclass(frozen=True, eq=False)
 class Readings:
-    """Numbers at one joint position of a chart."""
+    """Numbers of a chart at one joint position."""
 
     q: Array  #: (n,) [rad] or [m]
-    x: Array  #: (m,) task value
+    x: Array  #: (m,) task values
     xi: Array  #: (r,)
-    drift: Array  #: (m,) |x - held x|, in the units of the task
+    drift: Array  #: (m,) |x - desired x|, in the units of the task
     leak_deg: Array  #: (r,) leak of each coordinate [deg]
-    conditioning: float  #: 1 perfect, 0 singular
+    conditioning: float  #: 1: perfect, 0: singular
     boundary: float  #: distance to the boundary of the domain [rad] or [m]
-    nearest: int  #: the joint that is nearest to it
-    inside: Array  #: (n,) place of each joint in the domain: -1 and 1 are its boundaries, 0 its middle
+    nearest: int  #: the joint nearest to the boundary
+    inside: Array  #: (n,) position of each joint in the domain: -1 and 1 at the boundaries, 0 at the centre
     stop: str = ""  #: what stopped the last motion, or ""
 
 
 class Readers:
-    """Takes readings of a chart."""
+    """Computes the readings of a chart."""
 
     def __init__(self, chart: Chart) -> None:
         self._chart = chart
@@ -59,11 +59,12 @@ class Readers:
         self._middle, self._half_width = domain.centre, domain.half_width
 
     def read(self, q: Array, held: Array, stop: str = "") -> Readings:
-        """Readings at a joint position (n,), with the task value (m,) that should not change."""
+        """Readings at a joint position (n,); `held` (m,) is the task value that should stay constant."""
         chart = self._chart
         phi = chart.phi(q)
         quality = chart.quality(q)
-        # Where the joints are in the domain, from -1 to 1, and how far they may still move; endless ones have no end.
+        # Positions of the joints in the domain, from -1 to 1, and their distances to the boundaries; endless joints
+        # have none.
         inside = (q - self._middle) / self._half_width
         room = np.where(self._free, np.inf, self._half_width - np.abs(q - self._middle))
         return Readings(
@@ -81,18 +82,18 @@ class Readers:
 
 
 class ChartPanel:
-    """Writes the readings of one chart."""
+    """Writes the readings of one chart as HTML."""
 
     def __init__(self, chart: Chart, place: str = "", mirrored: bool = False) -> None:
         self.place = place
         problem = chart.problem
-        # Bars of the joints, with the domain unless the arm is mirrored out of it.
+        # Bars of the joints show the domain, unless the arm is mirrored.
         robot, domain = problem.robot, problem.domain
         low, high = (None, None) if mirrored else domain.bounds
         self._joints = JointBars(robot, low, high)
         self._labels, self._units = chart.labels, problem.task.units
         self._half_width = float(domain.half_width.min())
-        # Whose chart it is, which does not change.
+        # The head names the chart and does not change.
         task = ", ".join(map(escape, chart.labels[: chart.m]))
         self._wide = "branch" in chart.notes
         self._levels = (0.15, 0.04) if self._wide else (0.4, 0.15)
@@ -107,11 +108,11 @@ class ChartPanel:
         self._head = f'<div class="name">{title}</div><div class="about">{"<br>".join(lines)}</div>'
 
     def format_html(self, readings: Readings, nearest: str = "", ends: str = "") -> str:
-        """The page; `nearest` is a part about collisions, and `ends` about the range of a coordinate."""
+        """The HTML page; `nearest` is a part about collisions, and `ends` a part about the range of a coordinate."""
         m = len(readings.x)
-        # What stopped the last motion, and the leak of each coordinate.
+        # What stopped the last motion, then the leak of each coordinate.
         stop = f'<div class="stop">stopped by {escape(readings.stop)}</div>' if readings.stop else ""
-        # On a whole branch, leaks of tens of degrees are no fault.
+        # On a whole branch, leaks of tens of degrees are normal.
         whole = 90 if self._wide else 15
         leaks = [
             format_bar(
@@ -128,7 +129,7 @@ class ChartPanel:
             leaks.append(format_row("speed to hold it", most, "of the least, at most"))
         if self._wide:
             leaks.append('<div class="about">tens of degrees are normal on a whole branch</div>')
-        # How near the boundary and folds are, and how far the task has moved.
+        # Distances to the boundary and to folds, then the drift of the task.
         joint, fraction = readings.nearest, readings.boundary / self._half_width
         label = f"boundary {self._joints.shown[joint]}" if np.isfinite(readings.boundary) else "boundary"
         text, colour = self._joints.format_value(joint, readings.boundary), choose_colour(fraction, 0.15, 0.04)
@@ -148,10 +149,10 @@ class ChartPanel:
 
 
 class JointBars:
-    """One bar for each joint: its limits, the domain as a darker band, and where the joint is."""
+    """One bar for each joint: its limits, the domain as a darker band, and its position."""
 
     def __init__(self, robot: Robot, low: Array | None = None, high: Array | None = None) -> None:
-        # Tracks from limit to limit, or over the domain, or a full turn; the domain is a band in them.
+        # A track covers the limits, or else the domain, or else a full turn. The domain is a band in it.
         names, lower, upper = robot.joint_names, robot.lower, robot.upper
         low = lower if low is None else np.maximum(low, lower)
         high = upper if high is None else np.minimum(high, upper)
@@ -169,12 +170,12 @@ class JointBars:
         return "".join(self._format_bar(*joint, value) for joint, value in zip(self._joints, q.tolist(), strict=True))
 
     def format_copy(self, q: Array) -> str:
-        """All joints as text that one click selects, to copy them [rad], [m]."""
+        """All joint positions as text that one click selects for copying [rad], [m]."""
         numbers = ", ".join(f"{value:.6g}" for value in q.tolist())
         return f'<div class="about">to copy, rad and m:</div><div class="copy">{numbers}</div>'
 
     def format_value(self, i: int, value: float) -> str:
-        """A position of the i-th joint, or a way of it, with its unit."""
+        """A position or displacement of joint i, with its unit."""
         return f"{value:.3f} m" if self._slides[i] else f"{round(np.degrees(value), 1) + 0.0:.1f}°"
 
     def _format_bar(
@@ -194,21 +195,21 @@ class JointBars:
 
 
 def name_robot(robot: Robot, known: str = "") -> str:
-    """A robot's name for people: the words that its joints' names share, as panda_joint1 has panda, or a known one."""
+    """A robot's display name: a known one, or the words shared by its joints' names, such as panda of panda_joint1."""
     first = robot.joint_names[0]
     shared = first.removesuffix(strip_shared_words(robot.joint_names)[0]).strip("_")
     return shared or known or robot.tree.tip_name
 
 
 def strip_shared_words(names: Sequence[str]) -> list[str]:
-    """Names without the words before a "_" that all of them begin with, as in panda_joint1, panda_joint2."""
+    """Names without the words before a "_" that all of them share, such as panda in panda_joint1, panda_joint2."""
     words = [name.split("_") for name in names]
     shared = len(list(takewhile(lambda same: len(set(same)) == 1, zip(*(each[:-1] for each in words), strict=False))))
     return ["_".join(each[shared if len(names) > 1 else 0 :]) for each in words]
 
 
 def format_bar(label: str, fraction: float, text: str, colour: str, value: float, name: str = "") -> str:
-    """A row with a label, a bar that fills a share of its width, and a number with a name, by default the label."""
+    """A row with a label, a bar filled to a fraction of its width, and a number with a name (default: the label)."""
     width = 100 * float(np.clip(fraction if np.isfinite(fraction) else 0.0, 0, 1))
     number = format_number(name or label, value, text)
     return (
@@ -218,18 +219,18 @@ def format_bar(label: str, fraction: float, text: str, colour: str, value: float
 
 
 def format_number(name: str, value: float, text: str) -> str:
-    """A number as text, a dash if it is none; its exact value is in `data-value`, for programs that read the page."""
+    """A number as text, a dash if it is not finite; `data-value` has the exact value for other programs."""
     shown = "∞" if value == np.inf else text if np.isfinite(value) else "-"
     return f'<b data-oc="{escape(name)}" data-value="{value!r}">{escape(shown)}</b>'
 
 
 def choose_colour(value: float, good: float, fair: float) -> str:
-    """Colour of a value that is better the larger it is."""
+    """Colour of a value for which larger is better."""
     return GOOD if value >= good else FAIR if value >= fair else POOR
 
 
 def format_drift(drift: Array, units: Sequence[str]) -> str:
-    """How far the components of a task have moved (m,): lengths and angles, in words of a scale that people know."""
+    """The drift of the task components (m,) in words: lengths and angles in units of a familiar scale."""
     parts = [
         _format_scaled(unit, [d for d, u in zip(drift.tolist(), units, strict=True) if u == unit]) for unit in units
     ]
@@ -237,7 +238,7 @@ def format_drift(drift: Array, units: Sequence[str]) -> str:
 
 
 def _format_scaled(unit: str, drifts: Sequence[float]) -> str:
-    """The largest of some differences in a unit."""
+    """The largest of several differences, in a unit."""
     drift = max(drifts)
     if unit == "rad":
         degrees = float(np.degrees(drift))
@@ -249,7 +250,7 @@ def _format_scaled(unit: str, drifts: Sequence[float]) -> str:
 
 
 class RobotPanel:
-    """Writes the joints and the tip of a robot."""
+    """Writes the joints and the tip of a robot as HTML."""
 
     def __init__(self, robot: Robot) -> None:
         self._robot, self._joints = robot, JointBars(robot)
@@ -268,20 +269,20 @@ class RobotPanel:
 
 
 def format_row(label: str, value: float, note: str = "") -> str:
-    """A row with a name and a number, and perhaps a note between them."""
+    """A row with a name, an optional note, and a number."""
     name = f'<span title="{escape(label)}">{escape(label)}</span><span class="about">{escape(note)}</span>'
     return f'<div class="row">{name}{format_number(label, value, f"{value:.4f}")}</div>'
 
 
 class PlayerPanel:
-    """Writes where motions are: quantities of one motion, or how far the joints of several are from their start."""
+    """Writes the state of motions: quantities of one motion, or distances of several motions from their start."""
 
     def __init__(self, robot: Robot, motions: Sequence[Motion], units: Mapping[str, str] | None = None) -> None:
         self._units, self._motions, self._joints = units or {}, motions, JointBars(robot)
         self._prismatic = np.array(robot.tree.prismatic)
 
     def format_html(self, seconds: float) -> str:
-        """The page some seconds after the start."""
+        """The HTML page at a time after the start [s]."""
         several = len(self._motions) > 1
         parts = [
             self._format_distance(motion, seconds) if several else self._format_alone(motion, seconds)

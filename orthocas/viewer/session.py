@@ -1,4 +1,4 @@
-"""What a user's wishes do to the joints of a chart: wishes, undo, home, and the mirrored arm."""
+"""A user's session with a chart: targets for phi, undo, home, and the mirrored arm."""
 
 from collections.abc import Mapping
 
@@ -19,7 +19,7 @@ from orthocas.viewer.panel import Readers, Readings
 
 
 def describe_stop(stop: Stop, robot: Robot) -> str:
-    """What ends a motion; a joint's position with its unit."""
+    """Text about what ends a motion; for a joint, its position with unit."""
     if stop.kind is not StopKind.JOINT:
         return str(stop)
     slides = robot.tree.prismatic[robot.joint_names.index(stop.joint)]
@@ -28,15 +28,15 @@ def describe_stop(stop: Stop, robot: Robot) -> str:
 
 
 class Session:
-    """A joint position of a chart that follows what is wished for components of phi.
+    """A joint position of a chart that follows targets for components of phi.
 
-    A wish names components of phi, such as {"xi1": 0.2}; the others keep their values. `follow` moves q along the
-    straight line in phi with a tracker, so within the domain and without jumps. Where the line leaves the domain or
-    meets a fold, q stays before it, and the wish is given up. A session belongs to one thread.
+    A target names components of phi, such as {"xi1": 0.2}; the others keep their values. `follow` moves q along the
+    straight line in phi with a tracker, so q stays within the domain and never jumps. If the line leaves the domain or
+    meets a fold, q stops before it, and the target is dropped. A session belongs to one thread.
 
     Args:
         chart: a fitted chart.
-        q: where to begin, (n,); default: the centre of the domain.
+        q: initial joint position, (n,); default: the centre of the domain.
 
     Raises:
         NoExpressionError: if the coordinates are grown.
@@ -44,13 +44,13 @@ class Session:
     """
 
     flips: tuple[int, ...] = ()  #: cuts of `branches` at which the arm is mirrored
-    branches: Branches | None = None  #: of the robot, once they were asked for
+    branches: Branches | None = None  #: branches of the robot, after a search
 
     def __init__(self, chart: Chart, q: Array | None = None) -> None:
         require_kind("chart", chart, Chart)
         self.home: Array = chart.problem.domain.home if q is None else as_point("q", q, chart.n)
         self._past: list[tuple[Array, tuple[int, ...]]] = []
-        # Whether a joint limit of the mirrored arm stopped it.
+        # Whether a joint limit of the mirrored arm stopped the motion.
         self._limited = False
         self.chart = chart
         self._tracker = chart.tracker(self.home)
@@ -60,7 +60,7 @@ class Session:
 
     @property
     def place(self) -> str:
-        """The branch of the arm while it is mirrored, for the panel; empty otherwise."""
+        """The branch of a mirrored arm, for the panel; empty if the arm is not mirrored."""
         if not (self.branches and self.flips):
             return ""
         branch = self.branches.of(self.mirror(self.q[None])[0])
@@ -73,39 +73,41 @@ class Session:
 
     @property
     def readings(self) -> Readings:
-        """What the page shows about q; the task should have the value that was last wished for."""
+        """The readings at q, with the task value of the last target as reference."""
         return self._readers.read(self.q, self._target[: self.chart.m], self.stop)
 
     def mirror(self, q: Array) -> Array:
-        """The arm at positions of the chart (N, n), mirrored at `flips`: other joints, the same pose of the tip."""
+        """Joint positions of the arm for positions of the chart (N, n): mirrored at `flips`, same pose of the tip."""
         for cut in self.flips:
             assert self.branches is not None
             q = np.array([self.branches.mirrored(point, cut) for point in q])
         return q
 
     def find_allowed(self, q: Array) -> NDArray[np.bool_]:
-        """Whether the arm at positions of the chart (N, n) is within its joint limits when it is mirrored, (N,)."""
+        """Whether the (mirrored) arm is within its joint limits at positions of the chart (N, n), (N,)."""
         robot, shown = self.chart.problem.robot, self.mirror(q)
         return np.asarray(((shown >= robot.lower) & (shown <= robot.upper)).all(axis=1)) | (not self.flips)
 
     def flip(self, cut: int) -> None:
-        """Mirror the arm at one of `branches.mirrors`, or turn it back; the tip keeps its pose.
+        """Mirror the arm at one of `branches.mirrors`, or undo this; the tip keeps its pose.
 
-        Coordinates of the mirrored arm are those of its image in the chart, so no other chart is needed. If a joint
-        limit is in the way, xi goes to the nearest value where none is.
+        The coordinates of the mirrored arm are those of its mirror image in the chart, so no other chart is needed. If
+        the mirrored arm would exceed a joint limit, xi moves to the nearest value where it does not.
 
         Raises:
-            InvalidValueError: if a joint limit is in the way at all values of xi.
+            InvalidValueError: if the mirrored arm exceeds a joint limit at all values of xi.
         """
         self.remember()
         before, self.flips = self.flips, tuple(sorted({*self.flips} ^ {cut}))
-        # The nearest position on the self-motions that the joint limits of the mirrored arm allow.
+        # Find the nearest position on the self-motions where the mirrored arm is within its joint limits.
         curves = [fan_along(self.chart, self.q, k).q for k in range(self.chart.r)]
         places = np.concatenate([self.q[None], *curves])
         good = places[self.find_allowed(places)]
         if not len(good):
             self.flips = before
-            raise InvalidValueError("the mirrored arm", "beyond its joint limits", "another pose of the tip")
+            raise InvalidValueError(
+                "the mirrored arm", "beyond its joint limits", "a pose of the tip at which it is within them"
+            )
         self._move_to(good[np.argmin(np.linalg.norm(good - self.q, axis=1))])
 
     @property
@@ -114,7 +116,7 @@ class Session:
         return bool(self._past)
 
     def wish(self, values: Mapping[str, float]) -> None:
-        """Wish for values of some components of phi, by their labels.
+        """Set targets for some components of phi, by their labels.
 
         Raises:
             UnknownNameError, InvalidValueError: if there is no such component, or a value is not finite.
@@ -125,19 +127,19 @@ class Session:
             require_known("component of phi", str(label), self.chart.labels)
             number = as_number(f"wish for {label}", value)
             if not np.isfinite(number):
-                raise InvalidValueError(f"wish for {label}", value, "a finite number")
+                raise InvalidValueError(f"target for {label}", value, "a finite number")
             wished[self.chart.labels.index(label)] = number
         self._target = wished
 
     def follow(self, most_steps: int = RULES.tracker_steps) -> bool:
-        """Move towards the wish. Returns whether q has moved; afterwards the wish is met, given up, or still ahead."""
+        """Move towards the target. Returns whether q moved; then the target is reached, dropped, or still ahead."""
         moved = False
         for _ in range(most_steps):
             here = self.chart.phi(self.q)
             if not self._find_far(here).any():
                 break
             if not self._step(here):
-                # Aim at what there is in place of what cannot be, and say what is in the way.
+                # Drop the unreachable part of the target, and report what stops the motion.
                 self._target = np.where(self._find_far(here), here, self._target)
                 if self._limited:
                     self.stop = "a joint limit of the mirrored arm"
@@ -150,7 +152,7 @@ class Session:
         return moved
 
     def find_reach(self, k: int) -> tuple[float, float]:
-        """The lowest and highest value of the k-th component of phi along a line from here, with the others held."""
+        """The lowest and highest value of component k of phi on a line from here, with the other components fixed."""
         here, size, ends = self.chart.phi(self.q), float(self.chart.parts.phi_sizes[k]), []
         for sense in (-1.0, 1.0):
             tracker, far, step = self.chart.tracker(self.q), 0.0, size / RULES.reach_steps
@@ -172,12 +174,12 @@ class Session:
         return ends[0], ends[1]
 
     def remember(self) -> None:
-        """Keep the joint position, for `undo`."""
+        """Store the joint position for `undo`."""
         if not self._past or not self._is_here(*self._past[-1]):
             self._past = [*self._past[-RULES.most_undone :], (self.q, self.flips)]
 
     def undo(self) -> None:
-        """Return to the last joint position that was remembered and is another one."""
+        """Return to the last stored joint position that differs from the present one."""
         while self._past:
             before, flips = self._past.pop()
             if not self._is_here(before, flips):
@@ -186,17 +188,17 @@ class Session:
                 return
 
     def go_home(self) -> None:
-        """Return to where the session began."""
+        """Return to the initial position of the session."""
         self.remember()
         self.flips = ()
         self._move_to(self.home)
 
     def _is_here(self, q: Array, flips: tuple[int, ...]) -> bool:
-        """Whether the arm is there."""
+        """Whether the arm is at this position, with these flips."""
         return bool((q == self.q).all()) and flips == self.flips
 
     def _step(self, here: Array) -> bool:
-        """Step as far along the line as the tracker allows. Returns whether it allows any step."""
+        """Step as far along the line as the tracker allows. Returns whether a step was possible."""
         fraction, before, self._limited = 1.0, self.q, False
         while fraction >= RULES.shortest_step:
             self._tracker.step(here + fraction * (self._target - here))
@@ -209,7 +211,7 @@ class Session:
         return False
 
     def _find_far(self, here: Array) -> NDArray[np.bool_]:
-        """Which components of phi are not yet what is wished for, (n,)."""
+        """Which components of phi have not reached their target, (n,)."""
         return np.asarray(np.abs((self._target - here) / self.chart.parts.phi_sizes) > RULES.reached)
 
     def _move_to(self, q: Array) -> None:

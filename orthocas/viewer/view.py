@@ -1,6 +1,6 @@
-"""`orthocas.view`: charts, robots and motions in a browser, and pages in one file.
+"""`orthocas.view`: charts, robots and motions in a browser, and as pages in one file.
 
-Motions have a time slider, robots sliders for their joints; `chart_page` has the page of a chart.
+Motions have a time slider, and robots have sliders for their joints. `chart_page` has the page of a chart.
 """
 
 from __future__ import annotations
@@ -46,29 +46,30 @@ from orthocas.viewer.window import (
 PORT = 8080
 _SPEEDS = ("0.25x", "0.5x", "1x", "2x", "4x")
 _OURS = b"<!-- written by orthocas -->"
-Scene = Callable[[Any], tuple[float, Callable[[float], None]]]  #: builds a scene: its length [s], what shows an instant
+#: builds a scene on a server; returns its length [s] and a function that shows an instant
+Scene = Callable[[Any], tuple[float, Callable[[float], None]]]
 
 
 @dataclass(eq=False)
 class View:
-    """A page that a browser can open, until `close`; also a context manager.
+    """A page that a browser can open until `close`; also a context manager.
 
-    In a notebook it shows itself in a frame.
+    A notebook shows it in a frame.
     """
 
     url: str
-    missing: tuple[str, ...]  #: mesh files that were not found; rods stand for their links
+    missing: tuple[str, ...]  #: mesh files that were not found; rods replace their links
     _server: Any = field(repr=False)
     _page: Any = field(repr=False)
     _closed: threading.Event = field(default_factory=threading.Event, repr=False)
 
     def wait(self) -> None:
-        """Wait until `close` is called elsewhere, or Ctrl-C."""
+        """Wait until `close` is called elsewhere, or until Ctrl-C."""
         while not self._closed.wait(0.2):
             pass
 
     def close(self) -> None:
-        """End the page."""
+        """Close the page."""
         if not self._closed.is_set():
             self._closed.set()
             self._page.close()
@@ -95,43 +96,42 @@ def view(
     host: str = LOCAL,
     port: int = PORT,
 ) -> View:
-    """Open a page for the browser: a chart to play with, a robot, or a motion.
+    """Open a page in the browser: an interactive chart, a robot, or a motion.
 
     Args:
-        shown: a fitted chart, a robot, a `Trajectory` of `simulate`, a `JointMotion` of `follow`, or a
-            sequence of `Motion` of one robot, which move side by side.
-        robot: for motions: whose they are, or a chart of that robot.
+        shown: a fitted chart, a robot, a `Trajectory` of `simulate`, a `JointMotion` of `follow`, or a sequence of
+            `Motion` of one robot, which are shown side by side.
+        robot: for motions: the robot that moves, or a chart of it.
         robot_file: URDF file of the robot with its meshes. Default: drums and rods, made from the kinematic tree.
         locked: joints that were locked when the robot was built from that file, with their positions [rad] or [m].
-        collisions: for charts, such as `robot.collisions`: the page shows the nearest pair, in red where it is close,
-            and the objects of its scene.
-        path: for charts: waypoints of the task (N, m), or of the task and the coordinates (N, n), joined by straight
-            lines. A button plays it from where the arm is.
-        host: address to listen at. By default only this machine can open the page. The page's address holds a random
-            token, which stands for a password.
-        port: of the page; 0 takes any free one.
+        collisions: for charts, such as `robot.collisions`. The page then shows the nearest pair, in red if it is close,
+            and the objects of the scene.
+        path: for charts: waypoints of the task (N, m), or of task and coordinates (N, n), joined by straight lines. A
+            button plays it from the present position.
+        host: address to listen at. By default only this machine can open the page. The page's address contains a random
+            token that acts as a password.
+        port: port of the page; 0 takes any free one.
 
     Returns:
-        The running page, with its `url`. It lives in threads of this process.
+        The running page with its `url`. It runs in threads of this process.
 
     Raises:
         MissingExtraError: if viser is not installed.
-        ViewError: if the port is taken, or the host is no address of this machine.
+        ViewError: if the port is taken, or the host is not an address of this machine.
         NoExpressionError: for grown charts.
-        RobotError: if the robot file is another robot's.
-        InvalidValueError: if collisions are another robot's, or collisions or a path are given without a chart.
+        RobotError: if the robot file belongs to another robot.
+        InvalidValueError: if collisions belong to another robot, or collisions or a path are given without a chart.
     """
-    # What is shown decides which page it gets.
     arm, motions = read_subject(shown, robot)
     if collisions is not None:
         require_kind("collisions", collisions, Collisions)
         collisions.require_for(arm.tree)
         if not isinstance(shown, Chart):
-            raise InvalidValueError("collisions", f"given with a {type(shown).__name__}", "a chart with it")
+            raise InvalidValueError("collisions", f"given with a {type(shown).__name__}", "a chart to show")
     points = None
     if path is not None:
         if not isinstance(shown, Chart):
-            raise InvalidValueError("path", f"given with a {type(shown).__name__}", "a chart with it")
+            raise InvalidValueError("path", f"given with a {type(shown).__name__}", "a chart to show")
         width = np.shape(path)[1:]
         points, _ = as_point_set("path", path, shown.n if width == (shown.n,) else shown.m)
     shape = build_shape(arm, robot_file, locked)
@@ -161,13 +161,13 @@ def export_page(
     locked: Mapping[str, float] | None = None,
     force: bool = False,
 ) -> RobotLook:
-    """Write one self-contained HTML file that shows the same without a server, and works offline.
+    """Write one self-contained HTML file that shows an animation without a server and offline.
 
-    A chart moves each coordinate to its ends and back. Sliders need `view`.
+    For a chart, each coordinate moves over its range and back. Only `view` has sliders.
 
     Args:
         shown: as in `view`.
-        path: the file.
+        path: path of the HTML file.
         robot: as in `view`.
         robot_file: as in `view`.
         locked: as in `view`.
@@ -178,7 +178,6 @@ def export_page(
     """
     target = as_path("path", path)
     require_page(target, force)
-    # What is shown decides which scene is recorded.
     arm, motions = read_subject(shown, robot)
     shape = build_shape(arm, robot_file, locked)
     scene: Scene
@@ -198,7 +197,8 @@ def require_page(path: Path, force: bool) -> None:
     """Check, before long work, that a page can be written.
 
     Raises:
-        ArchiveError: if the folder is missing or not writable, or there is a file of others, or a symbolic link.
+        ArchiveError: if the folder is missing or not writable, or the path is a symbolic link or a file not of
+            orthocas.
     """
     require_writable(path, ArchiveError)
     ours = path.is_file() and path.read_bytes().endswith(_OURS)
@@ -206,14 +206,14 @@ def require_page(path: Path, force: bool) -> None:
 
 
 def read_subject(shown: Any, robot: Robot | Chart | None) -> tuple[Robot, Sequence[Motion]]:
-    """The robot to draw, and what moves it; no motions for a chart and a robot."""
+    """The robot to draw and its motions, which are empty for a chart or a robot."""
     if isinstance(shown, GrownChart):
         raise NoExpressionError("a view needs coordinates with a CasADi expression; received grown coordinates")
     if isinstance(shown, Chart):
         return shown.problem.robot, ()
     if isinstance(shown, Robot):
         return shown, ()
-    # A motion, or several.
+    # One motion, or several.
     if isinstance(shown, Trajectory):
         motions: tuple[Motion, ...] = (Motion.of_run(shown),)
     elif isinstance(shown, JointMotion):
@@ -223,7 +223,7 @@ def read_subject(shown: Any, robot: Robot | Chart | None) -> tuple[Robot, Sequen
     if not motions or not all(isinstance(part, Motion) for part in motions):
         expected = f"a chart, a robot, a run or a joint motion{suggest_attribute(shown, Chart)}"
         raise InvalidValueError("shown", f"a {type(shown).__name__}", expected)
-    # They belong to a robot.
+    # Motions need a robot.
     if not isinstance(robot, Robot | Chart):
         raise InvalidValueError("robot", repr(robot)[:80], "the robot that moved, or a chart of it")
     arm = robot if isinstance(robot, Robot) else robot.problem.robot
@@ -233,7 +233,7 @@ def read_subject(shown: Any, robot: Robot | Chart | None) -> tuple[Robot, Sequen
 
 
 def record_scene(build: Scene) -> str:
-    """The HTML of a scene and its motion. It is built on a server whose address is given to nobody."""
+    """The HTML of a scene with its motion, recorded on a private server."""
     server, _ = open_window(LOCAL, 0, "orthocas")
     try:
         duration, show = build(server)
@@ -248,19 +248,19 @@ def record_scene(build: Scene) -> str:
 
 
 def show_chart(chart: Chart, look: Look, server: Any) -> tuple[float, Callable[[float], None]]:
-    """Each coordinate in turn, from its lowest to its highest value and back, with the task held; a `Scene`."""
+    """Move each coordinate in turn over its range and back, with the task fixed; a `Scene`."""
     robot, home = chart.problem.robot, chart.problem.domain.home
     fans = [fan_along(chart, home, k) for k in range(chart.r)]
     arm, ghosts = Arm(server.scene, "/arm", robot, look), Ghosts(server.scene, robot)
     place_scene(server, robot, np.concatenate([fan.spread(5) for fan in fans]))
-    # The label stands above the highest joint.
+    # Put the label above the highest joint.
     above = robot.joint_points(home).max(axis=0) @ compute_up(robot) + 0.12 * compute_chain_length(robot.tree)
     label = server.scene.add_label("/label", "", position=tuple(above * compute_up(robot)), anchor="bottom-center")
     task, drawn = ", ".join(chart.labels[: chart.m]), -1
 
     def show(seconds: float) -> None:
         nonlocal drawn
-        # The coordinate whose turn it is; its ghosts are drawn once.
+        # Select the current coordinate; draw its ghosts once.
         k = min(int(seconds / RULES.recorded_sweep), chart.r - 1)
         if k != drawn:
             ghosts.show(fans[k].spread(RULES.ghosts), fans[k].spread(4 * RULES.ghosts))
@@ -275,7 +275,7 @@ def show_chart(chart: Chart, look: Look, server: Any) -> tuple[float, Callable[[
 def show_motions(
     robot: Robot, look: Look, motions: Sequence[Motion], server: Any
 ) -> tuple[float, Callable[[float], None]]:
-    """Motions side by side; a `Scene`."""
+    """Show motions side by side; a `Scene`."""
     stage = Stage(server.scene, robot, look, motions)
     place_scene(server, robot, np.concatenate([pick_few(motion.q) for motion in motions]), stage.shifts)
     speed = max(1.0, stage.duration / RULES.recorded_length)
@@ -283,20 +283,20 @@ def show_motions(
 
 
 def show_robot(robot: Robot, look: Look, server: Any) -> tuple[float, Callable[[float], None]]:
-    """A robot that stands still; a `Scene`."""
+    """Show a robot at rest; a `Scene`."""
     arm = Arm(server.scene, "/arm", robot, look)
     place_scene(server, robot, robot.tree.centre_posture[None])
     return 0.0, lambda seconds: arm.show(robot.tree.centre_posture)
 
 
 def _find_position(chart: Chart, fan: Fan, fraction: float) -> Array:
-    """The joint position (n,) after a fraction of a sweep, exactly on the curve: from home to both ends and back."""
-    # A sine through the present value, over nearly the whole range.
+    """The joint position (n,) at a fraction of a sweep from home to both ends and back, exactly on the curve."""
+    # Follow a sine through the present value, over nearly the whole range.
     here = np.interp(0.0, fan.arc_length, fan.xi)
     centre, half = (fan.xi[-1] + fan.xi[0]) / 2, (fan.xi[-1] - fan.xi[0]) / 2
     phase = np.arcsin(np.clip((here - centre) / max(half, 1e-12), -1, 1))
     target = centre + 0.99 * half * np.sin(2 * np.pi * fraction + phase)
-    # From the nearest stored position, exactly onto the curve.
+    # Start from the interpolated position, and correct it onto the curve.
     order = np.argsort(fan.xi)
     near = np.array([np.interp(target, fan.xi[order], column[order]) for column in fan.q.T])
     phi = chart.phi(chart.problem.domain.home)
@@ -305,7 +305,7 @@ def _find_position(chart: Chart, fan: Fan, fraction: float) -> Array:
 
 
 class Stage:
-    """Arms in a scene that move together, each with its tool path."""
+    """Arms in a scene that move together, with their tool paths."""
 
     def __init__(self, scene: Any, robot: Robot, look: Look, motions: Sequence[Motion]) -> None:
         self.motions = motions
@@ -314,7 +314,7 @@ class Stage:
         size = compute_chain_length(robot.tree)
         for k, (motion, shift) in enumerate(zip(motions, self.shifts, strict=True)):
             self._arms.append(Arm(scene, f"/arm{k}", robot, look, shift))
-            # The way of each tip, in few enough points.
+            # Draw the path of each tip with a limited number of points.
             rows = np.unique(np.linspace(0, len(motion.q) - 1, RULES.path_points).astype(int))
             ways = [robot.frame_position(motion.q[rows], tip) + shift for tip in robot.tips]
             ends = np.concatenate([np.stack([way[:-1], way[1:]], axis=1) for way in ways])
@@ -331,7 +331,7 @@ class Stage:
         return max(motion.duration for motion in self.motions)
 
     def show(self, seconds: float) -> None:
-        """Move all arms to where they are some seconds after the start."""
+        """Move all arms to their positions at a time after the start [s]."""
         for arm, motion in zip(self._arms, self.motions, strict=True):
             arm.show(motion.at(seconds))
 
@@ -349,7 +349,7 @@ class PlayerPage:
         self._now = 0.0
         place_scene(server, robot, np.concatenate([pick_few(motion.q) for motion in motions]), self._stage.shifts)
         self._readings = place_panels(server)
-        # Play and pause, the time, the speed, and whether to begin again.
+        # Controls: play and pause, time, speed, and repeat.
         gui, longest = server.gui, max(round(self._stage.duration, 2), RULES.time_step)
         self._playing = False
         self._play = gui.add_button("Play", icon="player-play")
@@ -364,12 +364,13 @@ class PlayerPage:
         self._loop.start()
 
     def close(self) -> None:
-        """End the thread of the page."""
+        """Stop the thread of the page."""
         self._loop.stop()
 
     def _plot_commands(self, robot: Robot, motion: Motion) -> None:
-        """What the controller commanded over time: a plot for the revolute and one for the prismatic joints."""
-        from viser import uplot  # only runs have plots
+        """Plot the controller's commands over time, for revolute and for prismatic joints."""
+        # Only runs have plots.
+        from viser import uplot
 
         assert motion.commands is not None
         rows = np.unique(np.linspace(0, len(motion.times) - 1, RULES.plot_points).astype(int))
@@ -395,14 +396,14 @@ class PlayerPage:
             )
 
     async def _slide(self, event: Any) -> None:
-        # Otherwise the page itself moved it.
+        # Events without a client come from the page itself.
         if event.client is not None:
             target = float(event.target.value)
             self._loop.ask("time", lambda: self._jump(target))
 
     def _toggle(self) -> None:
-        """Play from where the slider is, or stop."""
-        # A second click stops; at the end, playing begins anew.
+        """Play from the slider's position, or pause."""
+        # A second click pauses. At the end, playing starts from the beginning.
         if self._playing:
             self._pause()
             return
@@ -413,7 +414,7 @@ class PlayerPage:
 
         def tick(seconds: float) -> bool:
             nonlocal last
-            # The speed may change while it plays, so time is summed up.
+            # The speed may change during playback, so integrate the time.
             speed = float(self._speed.value.removesuffix("x"))
             now, last = self._now + speed * (seconds - last), seconds
             if now >= self._stage.duration and not self._again.value:
@@ -433,7 +434,7 @@ class PlayerPage:
     def _jump(self, seconds: float) -> None:
         self._pause()
         if not np.isfinite(seconds):
-            # Moves the slider back.
+            # Reset the slider.
             self._show(self._now)
             raise InvalidValueError("time", seconds, "a finite number of seconds")
         self._show(min(max(seconds, 0.0), self._stage.duration), slide=False)
@@ -452,13 +453,13 @@ class PlayerPage:
 
 
 def place_side_by_side(robot: Robot, count: int) -> Array:
-    """Where arms stand, (count, 3) [m]: in a row from left to right for the camera."""
+    """Positions of arms, (count, 3) [m], in a row from left to right as seen by the camera."""
     places = (np.arange(count) - (count - 1) / 2) * RULES.apart * compute_chain_length(robot.tree)
     return np.outer(places, np.cross(compute_up(robot), compute_camera_direction(robot)))
 
 
 def pick_few(q: Array) -> Array:
-    """Some of the joint positions (N, n), from first to last."""
+    """A few of the joint positions (N, n), from first to last."""
     rows: Array = q[np.unique(np.linspace(0, len(q) - 1, 20).astype(int))]
     return rows
 
@@ -474,7 +475,7 @@ class RobotPage:
         self._loop = Loop(lambda: None, partial(show_error, server))
         place_scene(server, robot, self._home[None])
         self._readings = place_panels(server)
-        # A slider for each joint around the centre, rounded inwards, so that its ends are within the limits.
+        # Sliders around the centre, rounded inwards so that their ends are within the limits.
         self._sliders = []
         with server.gui.add_folder("Joints"):
             for name, centre, *limits in zip(
@@ -493,7 +494,7 @@ class RobotPage:
         self._loop.start()
 
     def close(self) -> None:
-        """End the thread of the page."""
+        """Stop the thread of the page."""
         self._loop.stop()
 
     async def _go_home(self, event: Any) -> None:
@@ -501,7 +502,7 @@ class RobotPage:
             slider.value = min(max(round(value, 3), slider.min), slider.max)
 
     def _show(self) -> None:
-        # Values that are no numbers do not move the arm; the sliders go back, and the page says so.
+        # Values that are not finite do not move the arm. The sliders are reset, and the page shows an error.
         q = np.array([slider.value for slider in self._sliders])
         good = np.isfinite(q)
         for slider, value in zip(self._sliders, self._q.tolist(), strict=True):

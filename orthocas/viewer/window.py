@@ -1,4 +1,4 @@
-"""The server that a browser looks at: viser, bound to one address, guarded, with one thread of work."""
+"""The web server of views: viser, bound to one address, guarded, with one worker thread."""
 
 import asyncio
 import contextlib
@@ -52,34 +52,34 @@ _CAMERA_NUMBERS = {
     "image_width": 0,
 }
 _log = logging.getLogger(__name__)
-#: websockets' own log, in which an error takes one line
+#: log for websockets, which reports an error in one line
 connections = logging.getLogger(f"{__name__}.connections")
 _HOST = re.compile(r"(?P<name>\[[0-9a-f:.]+\]|[0-9a-z._-]+)(?::\d{1,5})?")
 LOCAL = "127.0.0.1"
-TITLES = ("<title>Viser</title>", "<title>{} - orthocas</title>")  #: of the page: viser's, and ours with a name
+TITLES = ("<title>Viser</title>", "<title>{} - orthocas</title>")  #: title of viser's page, and its replacement
 _SCRIPT = Path(__file__).with_name("page.js")
 Job = Callable[[], None]
-Tick = Callable[[float], bool]  #: seconds since it began -> whether it goes on
+Tick = Callable[[float], bool]  #: seconds since the start of an animation -> whether it continues
 _starting = Lock()
 
 
 class Inbox:
-    """Lets messages through to viser, and reports each that it drops in one line of the log."""
+    """Passes valid messages to viser, and logs each rejected message in one line."""
 
     def __init__(self) -> None:
-        self.input_of: Callable[[str], Any] = lambda uuid: None  #: the handle of an input, or None
+        self.input_of: Callable[[str], Any] = lambda uuid: None  #: uuid -> handle of an input, or None
 
     def find_fault(self, raw: object) -> str | None:
-        """What is wrong with a message, in a few words; None if it may pass."""
+        """What is wrong with a message, in a few words; None if it is valid."""
         try:
             message = import_module("msgspec").msgpack.decode(raw)
         except Exception as error:
-            # Text, or bytes of many kinds.
+            # Messages are text or bytes, and may be malformed.
             return f"it cannot be read ({type(error).__name__})"
         kind = message.pop("type", None) if isinstance(message, dict) else None
         if not isinstance(kind, str) or kind not in (_CAMERA, _INPUT, *_HANDLE):
             return f"pages send no {_shorten(kind)}"
-        # viser ends a connection at fields that it does not know, and at those that are missing.
+        # viser closes a connection if a field is unknown or missing.
         known = fields(getattr(import_module("viser._messages"), kind))
         needed = {field.name for field in known if field.default is MISSING}
         if not needed <= set(message) <= {field.name for field in known}:
@@ -92,15 +92,15 @@ class Inbox:
         return _check_words(message, "name", "owner") or _check_numbers(message, _HANDLE[kind])
 
     def _check_updates(self, uuid: str, updates: Any) -> str | None:
-        """Browsers change the value of an input, and nothing else about it."""
+        """Check that a browser changes only the value of an input."""
         if not isinstance(updates, dict) or set(updates) != {"value"}:
             return f"it changes {_shorten(updates)}, expected a value"
         handle = self.input_of(uuid)
-        # Viser drops what is gone.
+        # viser ignores inputs that no longer exist.
         return None if handle is None else _check_value(handle, updates["value"])
 
     def guard_handler(self, handler: Callable[[Any], Awaitable[None]]) -> Callable[[Any], Awaitable[None]]:
-        """viser's handler of a connection, without faulty messages, and with one line for what fails nevertheless."""
+        """viser's connection handler without faulty messages; errors that occur nevertheless give one line."""
 
         async def handle(connection: Any) -> None:
             asyncio.get_running_loop().set_exception_handler(_report)
@@ -123,7 +123,7 @@ def _check_words(message: dict[str, Any], *names: str) -> str | None:
 
 
 def _check_numbers(message: dict[str, Any], sizes: dict[str, int]) -> str | None:
-    """Size 0 stands for one number."""
+    """Check the counts of numbers in the fields of a message; size 0 stands for a single number."""
     for name, size in sizes.items():
         numbers = message[name] if size else [message[name]]
         if not isinstance(numbers, list | tuple) or len(numbers) != (size or 1) or not all(map(_is_number, numbers)):
@@ -132,14 +132,14 @@ def _check_numbers(message: dict[str, Any], sizes: dict[str, int]) -> str | None
 
 
 def _check_value(handle: Any, value: Any) -> str | None:
-    """A value is of the kind that the input has, and one that it offers."""
+    """Check that a value has the type of an input, and lies among the offered values."""
     if isinstance(handle.value, str):
         expected = f"one of {', '.join(handle.options)}"
         good = isinstance(value, str) and value in handle.options
     elif isinstance(handle.value, bool):
         expected, good = "true or false", isinstance(value, bool)
     else:
-        # Limits move while somebody slides.
+        # Limits may move while the user slides.
         slack = handle.max - handle.min
         expected = f"a number from {handle.min} to {handle.max}"
         good = _is_number(value) and handle.min - slack <= value <= handle.max + slack
@@ -151,12 +151,12 @@ def _is_number(value: object) -> bool:
 
 
 def _shorten(value: object) -> str:
-    """A value in a line: escaped and short."""
+    """A value as short, escaped text on one line."""
     return ascii(value)[: RULES.message_length]
 
 
 def _report(loop: asyncio.AbstractEventLoop, context: dict[str, Any]) -> None:
-    """One line for an error in a task of the server."""
+    """Log an error in a task of the server in one line."""
     error = context.get("exception")
     _log.warning("view: %s: %s", context["message"], _shorten(error))
     _log.debug("in the server of the view", exc_info=error)
@@ -172,15 +172,16 @@ def _shorten_record(record: logging.LogRecord) -> bool:
 connections.addFilter(_shorten_record)
 
 
-_VISER = "viser.infra._infra"  # the module that starts the server
+# Module that starts viser's server.
+_VISER = "viser.infra._infra"
 
 
 class Loop:
-    """Runs jobs, ticks of an animation, and `settle` once after a while without jobs.
+    """Runs jobs and animation ticks in one thread, and calls `settle` once after a pause without jobs.
 
     Args:
-        settle: what to do when nothing was asked for during a quarter of a second.
-        failed: called with an error in a job.
+        settle: called after a quarter of a second without jobs.
+        failed: called with the error of a job.
     """
 
     def __init__(self, settle: Job, failed: Callable[[Exception], None]) -> None:
@@ -193,12 +194,12 @@ class Loop:
         self._thread = threading.Thread(target=self._run, name="orthocas view", daemon=True)
 
     def start(self) -> None:
-        """Begin."""
+        """Start the thread."""
         self._running = True
         self._thread.start()
 
     def stop(self) -> None:
-        """End, after the job that is being done."""
+        """Stop the thread after the current job."""
         with self._wake:
             self._running = False
             self._wake.notify()
@@ -206,20 +207,20 @@ class Loop:
             self._thread.join(timeout=2.0)
 
     def ask(self, what: str, job: Job) -> None:
-        """Ask for a job; one that was asked for under the same name and has not begun is dropped."""
+        """Queue a job. It replaces a waiting job of the same name."""
         with self._wake:
             self._jobs.pop(what, None)
             self._jobs[what] = job
             self._wake.notify()
 
     def animate(self, tick: Tick | None) -> None:
-        """Call a function up to 30 times a second until it returns False; None ends an animation."""
+        """Call a function up to 30 times per second until it returns False; None stops an animation."""
         with self._wake:
             self._tick, self._begun = tick, time.monotonic()
             self._wake.notify()
 
     def build_handler(self, what: str, job: Job) -> Callable[[Any], Awaitable[None]]:
-        """A callback for events of viser that asks for a job."""
+        """A viser callback that queues a job."""
 
         async def handle(event: Any) -> None:
             self.ask(what, job)
@@ -229,12 +230,12 @@ class Loop:
     def _run(self) -> None:
         settled = True
         while self._running:
-            # Wait until there is something to do.
+            # Wait for a job, a tick, or the end.
             with self._wake:
                 if not self._jobs and self._running:
                     self._wake.wait(RULES.tick if self._tick else None if settled else RULES.quiet)
                 jobs, self._jobs, tick = list(self._jobs.values()), {}, self._tick
-            # The page settles once after a while without jobs.
+            # Settle once after a pause without jobs.
             if not jobs and tick is None and not settled:
                 jobs, settled = [self._settle], True
             elif jobs or tick is not None:
@@ -245,8 +246,8 @@ class Loop:
                 self._do(lambda tick=tick: self._advance(tick))  # type: ignore[misc]
 
     def _advance(self, tick: Tick) -> None:
-        """One tick of an animation."""
-        # An error ends it, too.
+        """Run one tick of an animation."""
+        # An error also ends the animation.
         goes_on = False
         try:
             goes_on = tick(time.monotonic() - self._begun)
@@ -258,36 +259,37 @@ class Loop:
         try:
             job()
         except Exception as error:
-            # A page shows an error and goes on.
+            # Show the error on the page and continue.
             _log.debug("a job of the view failed", exc_info=True)
             self._failed(error)
 
 
 @dataclass(frozen=True)
 class Guard:
-    """Judges requests for pages and websockets by their path and by the headers `Host` and `Origin`.
+    """Admits or refuses requests for pages and websockets by their path and their headers `Host` and `Origin`.
 
-    A browser sets both headers, and no page can change them. `Host` is the address that the browser asked; a name of
-    somebody else there means that his name leads here (DNS rebinding). `Origin` is the page that asks; it must be one
-    of this server's own. The path begins with a random token, so without the address nobody gets anything, not
-    even viser's own page, which an address could make connect to another server.
+    A browser sets both headers, and pages cannot change them. `Host` is the address that the browser requested. A
+    foreign name there means that this name was made to resolve to this server (DNS rebinding). `Origin` is the page
+    that sends the request; it must be a page of this server. The path begins with a random token. So nobody without the
+    address gets any content, not even viser's own page, which could be made to connect to another server.
     """
 
-    host: str  #: the address that the server listens at
+    host: str  #: address that the server listens at
     token: str = field(default_factory=lambda: secrets.token_urlsafe(16))
-    seen: list[bool] = field(default_factory=list)  #: not empty once a server is guarded
-    inbox: Inbox = field(default_factory=Inbox)  #: judges what comes through a websocket
-    title: str = "view"  #: what the page shows
+    seen: list[bool] = field(default_factory=list)  #: not empty after a server was guarded
+    inbox: Inbox = field(default_factory=Inbox)  #: checks messages of websockets
+    title: str = "view"  #: title of the page
 
     def admit(self, path: str, hosts: list[str], origins: list[str]) -> str | None:
-        """The path of a request behind the token; None if the request is refused.
+        """The path of a request after the token; None if the request is refused.
 
         Args:
-            path: path and query, as they came.
+            path: path and query of the request.
             hosts: all headers `Host`.
-            origins: all headers `Origin`; programs that are no browsers, and browsers that open a page, send none.
+            origins: all headers `Origin`; programs other than browsers send none, and browsers send none when they open
+                a page.
         """
-        # The token must be right, and the browser's page this server's own.
+        # The token must be right, and the requesting page must belong to this server.
         place, mark, query = path.partition("?")
         first, _, rest = place.removeprefix("/").partition("/")
         right_token = hmac.compare_digest(first.encode(errors="replace"), self.token.encode())
@@ -295,20 +297,20 @@ class Guard:
         return f"/{rest}{mark}{query}" if right_token and own else None
 
     def _is_own(self, host: str) -> bool:
-        """Whether a header `Host` can name this server. Any port can: tunnels change it.
+        """Whether a header `Host` can refer to this server. Any port is accepted, because tunnels change it.
 
-        A server that other machines reach has addresses that it does not know, behind routers and in containers. So it
-        takes all that are numbers: no name of somebody else can lead to them.
+        A server that other machines can reach does not know all its addresses, behind routers and in containers. So it
+        accepts all numeric addresses, because DNS rebinding always sends a name in `Host`.
         """
         match = _HOST.fullmatch(host.lower())
         if match is None:
             return False
         name = match["name"].strip("[]")
         own = is_local(self.host)
-        # By name: this machine's own, or the one that the server was told.
+        # A name must be localhost or the configured host.
         if name in ("localhost", self.host.lower()):
             return True
-        # By number: this machine, or any if others may reach it.
+        # A number must be this machine's, or any if others may reach the server.
         try:
             return ipaddress.ip_address(name).is_loopback or not own
         except ValueError:
@@ -325,12 +327,12 @@ def is_local(host: str) -> bool:
 
 @contextmanager
 def guard_server(host: str, title: str) -> Iterator[Guard]:
-    """Guard the server that viser starts within the block.
+    """Guard the server that viser starts within this context.
 
-    viser has no option for that. It looks `serve` of the package websockets up when it starts, so another function
-    stands there for that time, which puts the guard before viser's own answers.
+    viser has no option for this. It looks up the function `serve` of the package websockets when it starts, so this
+    context replaces the function by one that calls the guard before viser's own handlers.
 
-    A later viser may start it in another way: then `Guard.seen` stays empty.
+    If a later version of viser starts its server differently, `Guard.seen` stays empty.
     """
     guard, module = Guard(host, title=title), _import_server()
     with _starting:
@@ -343,17 +345,17 @@ def guard_server(host: str, title: str) -> Iterator[Guard]:
 
 
 def _import_server() -> Any:
-    """The module whose function `serve` is looked up."""
+    """The module in which viser looks up `serve`."""
     return import_module("websockets.asyncio.server")
 
 
 def _add_guard(serve: Callable[..., Any], guard: Guard) -> Callable[..., Any]:
-    """`serve`, which asks the guard before anything else; servers that are not viser's stay as they are."""
+    """A `serve` that calls the guard first for viser's servers, and leaves other servers unchanged."""
     answer_of = import_module("websockets.http11").Response
     headers_of = import_module("websockets.datastructures").Headers
 
     class Attentive(_import_server().ServerConnection):  # type: ignore[misc]
-        """A connection that is dropped if it asks for nothing: browsers keep some, and closing waited 6 s for them."""
+        """A connection that closes if it sends no request: browsers keep idle ones, and closing them took 6 s."""
 
         async def handshake(self, *arguments: Any, **options: Any) -> None:
             events = [self.request_rcvd, self.connection_lost_waiter]
@@ -361,7 +363,7 @@ def _add_guard(serve: Callable[..., Any], guard: Guard) -> Callable[..., Any]:
             if any(future.done() for future in events):
                 await super().handshake(*arguments, **options)
 
-    # viser's server gets the guard, with limits of messages, before its own answers.
+    # Guard viser's server and limit its messages.
     def serve_guarded(handler: Any, *arguments: Any, process_request: Any = None, **options: Any) -> Any:
         if getattr(handler, "__module__", None) != _VISER:
             return serve(handler, *arguments, process_request=process_request, **options)
@@ -383,12 +385,12 @@ def _add_guard(serve: Callable[..., Any], guard: Guard) -> Callable[..., Any]:
 
 
 def rename_page(answer: Any, title: str) -> Any:
-    """An answer with viser's page under another title; other answers stay as they are."""
+    """Replace the title in an answer with viser's page; other answers stay unchanged."""
     if answer is None or "html" not in answer.headers.get("Content-Type", ""):
         return answer
     body = build_page(answer.body, title, answer.headers.get("Content-Encoding") == "gzip")
     headers = answer.headers.copy()
-    # Or there would be two.
+    # Delete the header first, because assignment would add a second one.
     del headers["Content-Length"]
     headers["Content-Length"] = str(len(body))
     return replace(answer, headers=headers, body=body)
@@ -396,7 +398,7 @@ def rename_page(answer: Any, title: str) -> Any:
 
 @lru_cache(maxsize=2)
 def build_page(body: bytes, title: str, packed: bool = False) -> bytes:
-    """viser's page with another title, and our script before its own."""
+    """viser's page with another title, and with our script before its own."""
     page = gzip.decompress(body) if packed else body
     page = page.replace(TITLES[0].encode(), TITLES[1].format(escape(title)).encode(), 1)
     page = page.replace(b"<head>", b"<head><script>" + _SCRIPT.read_bytes() + b"</script>", 1)
@@ -404,7 +406,7 @@ def build_page(body: bytes, title: str, packed: bool = False) -> bytes:
 
 
 def viser() -> ModuleType:
-    """The package `viser`, which only views need.
+    """Import the package `viser`, which only views need.
 
     Raises:
         MissingExtraError: if it is not installed.
@@ -417,56 +419,58 @@ def open_window(host: str, port: int, title: str) -> tuple[Any, str]:
 
     Raises:
         MissingExtraError: if viser is not installed.
-        ViewError: if the port is taken, the host is no address of this machine, or viser cannot be guarded.
+        ViewError: if the port is taken, the host is not an address of this machine, or viser cannot be guarded.
     """
     package = viser()
     require_free(host, port)
-    # viser starts its server with our guard before it, and announces itself.
+    # Start viser's server with the guard, and suppress its announcement.
     with guard_server(host, title) as guard, contextlib.redirect_stdout(io.StringIO()):
         server = package.ViserServer(host=host, port=port, label=title, verbose=False)
     inputs = getattr(server.gui, "_gui_input_handle_from_uuid", None)
     if not guard.seen or inputs is None:
         close_window(server)
-        raise ViewError("this version of viser starts its server in another way, expected one that can be guarded")
-    # Somebody else was faster.
+        raise ViewError(
+            "this version of viser starts its server differently and cannot be guarded, expected a supported version"
+        )
+    # Another program has taken the port meanwhile.
     if port not in (0, server.get_port()):
         close_window(server)
         raise _build_taken_error(host, port)
-    # No sharing through a server of others, which any page in the browser could ask for.
+    # Disable sharing through an external server, which any page in the browser could request.
     guard.inbox.input_of = inputs.get
     server.request_share_url = lambda verbose=True: None
     server.gui.configure_theme(show_logo=False, show_share_button=False, brand_color=RULES.brand)
     server.scene.configure_environment_map(None)
-    # `place_lights` has lights without shadows.
+    # Shadows are off; `place_lights` adds lights without them.
     server.scene.configure_default_lights(False)
     return server, f"{build_url(host, server.get_port())}/{guard.token}"
 
 
 def show_error(server: Any, error: Exception) -> None:
-    """Tell an error to whoever looks at the page."""
+    """Show an error on the page."""
     text = str(error) if isinstance(error, OrthocasError) else f"{type(error).__name__}: {error}"
     for client in server.get_clients().values():
         client.add_notification("This did not work", text, color="red", auto_close_seconds=8.0)
 
 
 def close_window(server: Any) -> None:
-    """Stop a server; pages that are open in browsers say that they lost it."""
+    """Stop a server; open pages then report a lost connection."""
     with contextlib.redirect_stdout(io.StringIO()):
         server.stop()
 
 
 def require_free(host: str, port: int) -> None:
-    """Check that a server can listen there: viser itself would wait forever, or take another port.
+    """Check that a server can listen on a port, because viser would wait forever or take another one.
 
     Raises:
-        InvalidValueError: if the port is no number from 0 to 65535.
-        ViewError: if the port is taken, or the host is no address of this machine.
+        InvalidValueError: if the port is not a number from 0 to 65535.
+        ViewError: if the port is taken, or the host is not an address of this machine.
     """
     require_count("port", port, least=0, most=65535)
     if not isinstance(host, str) or not host:
         raise InvalidValueError("host", repr(host)[:80], "an address of this machine, such as 127.0.0.1")
     try:
-        # No questions to other machines.
+        # Avoid name look-ups over the network.
         numeric = 0 if host == "localhost" else socket.AI_NUMERICHOST
         family, kind, protocol, _, address = socket.getaddrinfo(host, port, type=socket.SOCK_STREAM, flags=numeric)[0]
     except (OSError, UnicodeError):
@@ -490,28 +494,28 @@ def build_url(host: str, port: int) -> str:
 
 
 def place_scene(server: Any, robot: Robot, q: Array, shift: Array | None = None) -> None:
-    """A floor, lights, and a camera; see `place_camera`."""
+    """Place floor, lights and camera; see `place_camera`."""
     place_floor(server, robot)
     place_lights(server, robot)
     place_camera(server, robot, q, shift)
 
 
 def place_camera(server: Any, robot: Robot, q: Array, shift: Array | None = None) -> None:
-    """Look at an arm from the front and slightly above, or at a planar arm from the side where its plane is seen.
+    """Place the camera in front of an arm and slightly above, or perpendicular to the plane of a planar arm.
 
     Args:
-        server: the window.
+        server: the viser server.
         robot: the arm.
-        q: joint positions (N, n) that should be in the picture.
-        shift: places of further arms, (k, 3) [m].
+        q: joint positions (N, n) that the picture should show.
+        shift: positions of further arms, (k, 3) [m].
     """
-    # A sphere around all arms in all positions that should be seen.
+    # A sphere around all arms in all these positions.
     points = robot.joint_points(q).reshape(-1, 3)
     points = np.concatenate([points, *(points + other for other in ([] if shift is None else shift))])
     low, high = points.min(axis=0), points.max(axis=0)
     centre = (low + high) / 2
     radius = max(float(np.linalg.norm(high - low)) / 2, 0.4 * compute_chain_length(robot.tree))
-    # The camera is far enough away for that sphere, and moves with the shape of the picture.
+    # Choose the distance from the sphere, and adapt it to the shape of the picture.
     up = compute_up(robot)
     server.scene.set_up_direction(tuple(up))
     frame = Framing(centre, compute_camera_direction(robot), RULES.room * radius / np.sin(RULES.view_angle / 2))
@@ -524,30 +528,31 @@ def place_camera(server: Any, robot: Robot, q: Array, shift: Array | None = None
 
 @dataclass(frozen=True, eq=False)
 class Framing:
-    """Keeps arms in the pictures of browsers of any shape, until somebody turns the scene."""
+    """Keeps arms inside pictures of any shape, until a user turns the scene."""
 
-    centre: Array  #: of the arms (3,) [m]
+    centre: Array  #: centre of the arms (3,) [m]
     direction: Array  #: unit vector to the camera (3,)
-    distance: float  #: of the camera for a picture that is as wide as high, or wider [m]
+    distance: float  #: camera distance for a picture at least as wide as high [m]
 
     def compute_view(self, width: float, height: float) -> tuple[Array, Array]:
-        """Position of the camera and the point that it looks at (3,) [m], for a picture of a size in pixels."""
+        """Camera position and its target point (3,) [m] for a picture size in pixels."""
         return self.centre + self.distance * height / min(width, height) * self.direction, self.centre
 
     def keep(self, client: Any) -> None:
-        """Place the camera of a browser anew when its picture changes its shape."""
+        """Move a browser's camera when its picture changes shape."""
         size, places, elsewhere = (0, 0), [np.array(client.camera.position)], float("inf")
 
         def changed(camera: Any) -> None:
             nonlocal size, elsewhere
             if min(camera.image_width, camera.image_height) < 1 or np.allclose(camera.look_at, camera.position):
-                return  # no picture
+                # There is no picture.
+                return
             if not any(
                 np.allclose(camera.position, place, atol=RULES.camera_slack * self.distance) for place in places
             ):
                 elsewhere = min(elsewhere, time.monotonic())
                 if time.monotonic() - elsewhere > RULES.camera_pause:
-                    # Somebody has turned the scene.
+                    # A user has turned the scene.
                     places.clear()
                 return
             elsewhere = float("inf")
@@ -564,7 +569,7 @@ class Framing:
 
 
 def place_panels(server: Any) -> Any:
-    """Sliders on the right and readings on the left, with the scene between them; returns the HTML of the readings."""
+    """Place sliders on the right and readings on the left of the scene; returns the HTML handle of the readings."""
     server.gui.main_panel.dock_right()
     server.gui.main_panel.set_width(RULES.panel_widths[1])
     panel = server.gui.add_panel()
@@ -576,9 +581,10 @@ def place_panels(server: Any) -> Any:
 
 
 def place_floor(server: Any, robot: Robot) -> None:
-    """A round grid under the arm, or behind a planar one, that fades into the background.
+    """A round grid under an arm, or behind a planar arm, that fades into the background.
 
-    Lines, because viser's own grid computes every point of the floor, which takes long without a graphics card.
+    It consists of lines, because viser's own grid computes every point of the floor, which is slow without a graphics
+    card.
     """
     size = compute_chain_length(robot.tree)
     radius = RULES.floor * size
@@ -586,12 +592,12 @@ def place_floor(server: Any, robot: Robot) -> None:
     cell = decade * max(part for part in (1, 2, 5) if part * decade <= size / 5)
     numbers = np.arange(-int(radius / cell), int(radius / cell) + 1)
     half = np.sqrt(radius**2 - (cell * numbers) ** 2)
-    # Lines of equal distance, cut off by the circle, in four points each: they fade towards both ends.
+    # Equally spaced lines, cut off by the circle, with four points each for fading towards both ends.
     along = np.outer(half, [-1.0, -RULES.fade, RULES.fade, 1.0])  # (lines, 4)
     across = np.repeat(cell * numbers[:, None], 4, axis=1)
     points = np.stack([along, across, 0 * along], axis=2)
     shade = np.where((numbers % 5 == 0)[:, None], *RULES.grid)
-    # Into the white of the background.
+    # Fade into the white background.
     fade = np.stack([0 * shade + 255, shade, shade, 0 * shade + 255], axis=1)
     lines, colours = np.concatenate([points, points[..., [1, 0, 2]]]), np.concatenate([fade, fade])
     lines = lines - [0.0, 0.0, 0.15 * size] if is_planar(robot) else lines @ rotate_z_to(compute_up(robot)).T
@@ -600,9 +606,9 @@ def place_floor(server: Any, robot: Robot) -> None:
 
 
 def place_lights(server: Any, robot: Robot) -> None:
-    """Light from the sky, from the left of the camera, and weaker from its right.
+    """Light from the sky, from the left of the camera, and weaker light from its right.
 
-    There are no shadows and no environment map: without a graphics card, they take most of the time of a picture.
+    Shadows and an environment map are off, because they take most of the drawing time without a graphics card.
     """
     scene, up, ahead = server.scene, compute_up(robot), compute_camera_direction(robot)
     left = np.cross(ahead, up)
@@ -614,7 +620,7 @@ def place_lights(server: Any, robot: Robot) -> None:
 
 
 def is_planar(robot: Robot) -> bool:
-    """Whether an arm moves in the x-y plane."""
+    """Whether all joints move in the x-y plane."""
     tree = robot.tree
     return bool(
         np.abs(tree.rotations[:, 2] - [0, 0, 1]).max() < RULES.flat
@@ -623,7 +629,7 @@ def is_planar(robot: Robot) -> bool:
 
 
 def compute_camera_direction(robot: Robot) -> Array:
-    """Unit vector to the camera: from the front, the side and above, or from where a plane is seen."""
+    """Unit vector to the camera: oblique from the front and above, or perpendicular to the plane of a planar arm."""
     if is_planar(robot):
         return np.array([0.0, 0.0, 1.0])
     up = compute_up(robot)
@@ -634,7 +640,7 @@ def compute_camera_direction(robot: Robot) -> Array:
 
 
 def compute_up(robot: Robot) -> Array:
-    """Against gravity; z without gravity."""
+    """Unit vector against gravity; z without gravity."""
     gravity = robot.tree.gravity
     strength = float(np.linalg.norm(gravity))
     return np.array([0.0, 0.0, 1.0]) if strength < RULES.flat else -gravity / strength

@@ -218,7 +218,7 @@ def test_joints_that_are_not_cyclic_are_refused() -> None:
     known = problems.get("iiwa")
     with pytest.raises(InvalidValueError, match="cyclic is 'A2', expected one of the cyclic joints: A1"):
         oc.fit(known, oc.Polynomial(2, ["A2"]), samples=100)
-    with pytest.raises(InvalidValueError, match="cyclic is 'A1', expected joints of A2, A3"):
+    with pytest.raises(InvalidValueError, match="cyclic is 'A1', expected one of the joints A2, A3"):
         oc.Polynomial(2, ["A1"]).family(_space(known).restricted_to([1, 2]), 1)
     with pytest.raises(InvalidValueError, match="for_problem"):
         oc.Polynomial(2, "auto").family(_space(known), 1)

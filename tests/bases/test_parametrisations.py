@@ -275,7 +275,7 @@ def test_fourier_refuses_a_prismatic_joint_by_name() -> None:
 def test_empty_mlp_is_refused() -> None:
     with pytest.raises(InvalidValueError, match="at least one hidden layer"):
         oc.MLP(())
-    with pytest.raises(InvalidValueError, match="at least one joint that enters the network"):
+    with pytest.raises(InvalidValueError, match="at least one joint neither in cyclic nor in without"):
         oc.MLP((3,), cyclic=["a", "b"], without=["c"]).family(SPACE, 1)
 
 

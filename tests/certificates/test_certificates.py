@@ -94,7 +94,7 @@ def test_what_is_printed_is_computed_again() -> None:
     known, honest = chart(), certified()
     centre = tuple(known.problem.domain.centre)
     assert not check_certificate(known, replace(honest, fold=(centre, centre)).seal())
-    with pytest.raises(CertifyError, match="leaves out singular values up to 0.3, the domain 0"):
+    with pytest.raises(CertifyError, match="excludes singular values up to 0.3, the domain 0"):
         check_certificate(known, replace(honest, least_singular_value=0.3).seal())
     box = honest.injective
     assert box is not None

@@ -123,8 +123,8 @@ def test_periods_are_read_from_the_steps() -> None:
     [
         (lambda q: ca.sin(ca.atan(q[0])), "the value of log, atan"),
         (lambda q: ca.fabs(q[0]), "operation fabs"),
-        (lambda q: q[0] ** 1.5, "power that is no whole number"),
-        (lambda q: q[0] ** np.inf, "power that is no whole number"),
+        (lambda q: q[0] ** 1.5, "exponent that is not a small integer constant"),
+        (lambda q: q[0] ** np.inf, "exponent that is not a small integer constant"),
         (lambda q: q[0] * ca.log(q[1]), "the value of log, atan"),
     ],
 )

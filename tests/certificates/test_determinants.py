@@ -215,7 +215,7 @@ def test_the_domain_keeps_folds_out_of_what_is_not_proved(tmp_path: Path) -> Non
     assert again.certificate.as_dict() == found.as_dict()
     assert check_certificate(again)
     assert not check_certificate(chart, replace(found, clear_share=0.9999).seal())
-    with pytest.raises(CertifyError, match="by another volume"):
+    with pytest.raises(CertifyError, match="by another bound on the volume"):
         check_certificate(chart, replace(found, least_volume=0.2).seal())
 
 

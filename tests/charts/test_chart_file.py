@@ -113,9 +113,9 @@ class Mine:
 
 @pytest.mark.slow
 def test_parametrisation_that_could_not_be_read_back_is_not_written(planar_x: oc.Problem, tmp_path: Path) -> None:
-    with pytest.warns(NotSavableWarning, match="parametrisation is Mine, expected a registered one"):
+    with pytest.warns(NotSavableWarning, match="parametrisation is Mine, expected a registered class"):
         chart = oc.fit(planar_x, Mine(), oc.solvers.LBFGS()).chart
-    with pytest.raises(InvalidValueError, match="parametrisation is Mine, expected a registered one"):
+    with pytest.raises(InvalidValueError, match="parametrisation is Mine, expected a registered class"):
         chart.save(tmp_path / "mine")
     assert list(tmp_path.iterdir()) == []
 

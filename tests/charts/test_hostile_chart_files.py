@@ -48,7 +48,7 @@ def test_missing_foreign_and_truncated_files_are_named(saved: Path, tmp_path: Pa
         oc.load(tmp_path / "text")
     for begin in ("<?xml version='1.0'?><robot/>", "\ufeff  <robot name='a'>", "<mujoco/>"):
         (tmp_path / "arm.urdf").write_text(begin, encoding="utf-8")
-        with pytest.raises(ChartFileError, match=r"XML file, such as of a robot \(Robot.from_file\), not a chart"):
+        with pytest.raises(ChartFileError, match=r"XML file, perhaps of a robot \(Robot.from_file\), expected a chart"):
             oc.load(tmp_path / "arm.urdf")
     with zipfile.ZipFile(tmp_path / "zip", "w") as other:
         other.writestr("a.txt", "a")

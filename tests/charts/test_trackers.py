@@ -288,7 +288,7 @@ def test_domains_without_an_expression_are_named() -> None:
     known = oc.problems.get("planar_3r_xy")
     chart = oc.fit(known, oc.Polynomial(2), samples=300).chart
     problem = oc.Problem(known.robot, known.task, domain=Ball(known.domain.centre, known.domain.half_width))
-    with pytest.raises(DomainError, match="kind 'ball' has no condition as an expression"):
+    with pytest.raises(DomainError, match="kind 'ball' has no CasADi expression of its condition"):
         oc.Chart(problem, chart.coordinates).tracker(known.domain.centre, nearest=True)
 
 

@@ -75,7 +75,7 @@ def test_schedules_objectives_and_obstacles(run: Run, chart: oc.Chart) -> None:
         (["--obstacle", "sphere:1,2"], "--obstacle sphere is '1,2', expected 4 numbers"),
         (["--obstacle", "cone:1,2"], "unknown kind of --obstacle 'cone', known: sphere, capsule, plane"),
         (["--sphere", "1,2,3,1"], "no such option: --sphere; use --obstacle sphere:X,Y,Z,RADIUS"),
-        (["--obstacle", "plane:0,0,0,0,0,0"], "normal is [0.0, 0.0, 0.0], expected a direction"),
+        (["--obstacle", "plane:0,0,0,0,0,0"], "normal is [0.0, 0.0, 0.0], expected a vector longer"),
         (["--link-radius", "0.1"], "--link-radius requires --obstacle"),
         (["--start", "1,2"], "no such option: --start; the start of a motion is set in Python"),
         (["--period", "often"], "received 'often', expected a number"),
@@ -107,7 +107,7 @@ BROKEN = {
     "x\n1\n2\n": "line 1: column 'y' is missing, expected x, y",
     "x,x\n1,2\n1,2\n": "line 1: column 'x' comes twice",
     "x,xi1\n1,2\n1,2\n": "line 1: column 'y' is missing, expected x, y, xi1",
-    'x,y\n1,2\n1,"2\n': "no CSV text",
+    'x,y\n1,2\n1,"2\n': "not CSV text",
 }
 
 

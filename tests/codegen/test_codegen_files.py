@@ -204,7 +204,7 @@ def test_command_writes_checks_and_refuses(planar_fit: Fit, run: Run) -> None:
     assert "lines of C99" in out
     for words, message in (
         (["--controller", "none", "--limit", "3"], "settings of a controller require a controller"),
-        (["--controller", "kinematic", "--stiffness", "3"], "kinematic has no --stiffness"),
+        (["--controller", "kinematic", "--stiffness", "3"], "kinematic has no option --stiffness"),
         (["--controller", "spring"], "unknown controller 'spring'"),
         (["--controller", "pd_plus", "--name", "a b"], "a C identifier"),
     ):

@@ -122,7 +122,7 @@ def test_what_is_no_gravity_is_refused() -> None:
         oc.Robot.from_urdf(file, gravity=[0, -9.81])
     with pytest.raises(InvalidValueError, match="gravity"):
         oc.Robot.from_urdf(file, gravity=[0, 0, np.nan])
-    with pytest.raises(RobotError, match="a base that nothing holds has no gravity"):
+    with pytest.raises(RobotError, match="a floating base has no gravity"):
         oc.Robot.from_urdf(file, base="floating", gravity=[0, 0, -9.81])
 
 

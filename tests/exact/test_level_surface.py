@@ -225,7 +225,9 @@ def test_bisection_takes_over_where_newton_runs_away() -> None:
 
 def test_function_that_jumps_is_refused() -> None:
     h, slope = of_height(lambda z: np.where(z > 0.05, 1.0, -1.0), np.zeros_like)
-    with pytest.raises(InvalidValueError, match=r"level is 0.0, .* that h does not jump across, as near .* 0.05\]"):
+    with pytest.raises(
+        InvalidValueError, match=r"level is 0.0, .* that h does not jump across; it does near .* 0.05\]"
+    ):
         build_level_surface(h, slope, 0.0, [-1, -1, -1], [1, 1, 1], 4)
 
 

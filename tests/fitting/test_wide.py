@@ -813,7 +813,7 @@ def test_command_fits_a_branch(run: Run) -> None:
     code, out, _ = run(*words, "--domain", "branch:shoulder+ elbow- wrist+", "--samples", "1000", "--force")
     assert code == 0
     assert ": xi1: like swivel [rad]" in out
-    message = "orthocas: --domain branch has a solver of its own: leave out --solver\n"
+    message = "orthocas: --domain branch uses its own solver: leave out --solver\n"
     assert run(*words, "--domain", "branch", "--solver", "lbfgs")[::2] == (2, message)
     words_of_python = "Python asks for one: arm.solve(x, xi, branch=NAME)"
     message = f"orthocas: no such option: --branch; fit names the branch by --domain branch:NAME; {words_of_python}\n"

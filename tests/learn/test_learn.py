@@ -137,7 +137,7 @@ def test_what_has_no_way_back_is_named() -> None:
         learn.coordinates_of(chart, [centre, centre + 9.0])
     phi = chart.phi(np.array([centre, centre]))
     phi[1, 0] += 50.0
-    with pytest.raises(InverseError, match="row 1 of 2 has no q near the last one: LOST"):
+    with pytest.raises(InverseError, match="row 1 of 2 has no solution near the previous one: LOST"):
         learn.joints_of(chart, phi, centre)
     with pytest.raises(ShapeError):
         learn.coordinates_of(chart, np.zeros((4, 9)))

@@ -366,7 +366,7 @@ WRONG: dict[str, tuple[dict[str, Any], str]] = {
     "other columns": ({"tool_path": np.zeros((5, 3))}, r"tool_path \(x, y\) has shape \(5, 3\), expected \('any', 2\)"),
     "one waypoint": ({"tool_path": [[1.0, 2.0]]}, "number of rows of tool_path is 1"),
     "NaN": ({"tool_path": [[1.0, 2.0], [1.0, np.nan]]}, r"y of tool_path\[1\] is nan, expected a finite number"),
-    "no motion": ({"tool_path": [[1.0, 2.0], [1.0, 2.0]]}, "waypoint 1 is the same as the one before it"),
+    "no motion": ({"tool_path": [[1.0, 2.0], [1.0, 2.0]]}, "waypoint 1 is the same as the previous one"),
     "failing function": ({"tool_path": lambda s: 1 / 0}, r"tool_path\(0\) is ZeroDivisionError"),
     "short schedule": ({"xi": np.zeros((5, 1))}, "number of rows of xi is 5, expected 60"),
     "unknown choice": ({"xi": "best"}, "xi is 'best', expected 'hold', 'objective'"),

@@ -121,5 +121,5 @@ def test_pickles_that_this_casadi_cannot_read_get_one_line(name: str, monkeypatc
         raise RuntimeError("Error in DeserializingStream at\n.../casadi/core/serializing_stream.cpp:157:\nmismatch")
 
     monkeypatch.setattr("casadi.Function.deserialize", refuse)
-    with pytest.raises(InvalidValueError, match=r"^pickle is of CasADi 3.0.1, expected one of CasADi [^\n]*$"):
+    with pytest.raises(InvalidValueError, match=r"^pickle is from CasADi 3.0.1, expected one of CasADi [^\n]*$"):
         pickle.loads(older)

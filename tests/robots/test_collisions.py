@@ -231,7 +231,7 @@ def test_files_say_which_pairs_are_checked_and_what_is_missing(tmp_path: Path) -
 
 
 def test_robots_without_solids_say_so(tmp_path: Path) -> None:
-    with pytest.raises(RobotError, match="nothing is known of the links' solids.*with_solids"):
+    with pytest.raises(RobotError, match="the links have no solids.*with_solids"):
         _ = oc.Robot.planar([1.0], [1.0]).collisions
     robot = build_arm(tmp_path, ["", '<mesh filename="lost.stl"/>'])
     with pytest.raises(RobotError, match="no mesh of link1"):

@@ -219,7 +219,7 @@ def test_c_of_a_chart_that_floats_equals_python(satellite: oc.Robot, tmp_path: P
 @pytest.mark.parametrize(
     ("call", "error", "reason"),
     [
-        (lambda chart: oc.control.PDPlus(chart, stiffness=10.0), RobotError, "pd_plus needs joints that motors drive"),
+        (lambda chart: oc.control.PDPlus(chart, stiffness=10.0), RobotError, "pd_plus needs driven joints"),
         (oc.control.Kinematic, RobotError, "no motor drives a floating base"),
         (lambda chart: Projector(chart.problem, 10.0, 1.0), RobotError, "Robot.zero_momentum"),
         (lambda chart: oc.follow(chart, np.zeros((2, 3))), RobotError, "following a path needs"),
@@ -230,7 +230,11 @@ def test_c_of_a_chart_that_floats_equals_python(satellite: oc.Robot, tmp_path: P
         (lambda chart: oc.fit(chart.problem, oc.Linear()), InvalidValueError, "such as Polynomial"),
         (lambda chart: oc.fit(chart.problem, split_idle=False), InvalidValueError, "the base floats"),
         (lambda chart: oc.fit(chart.problem, like="float_x"), InvalidValueError, "a floating base moves"),
-        (lambda chart: oc.fit(chart.problem, oc.Mobile(oc.Polynomial(2))), InvalidValueError, "joints of float_x"),
+        (
+            lambda chart: oc.fit(chart.problem, oc.Mobile(oc.Polynomial(2))),
+            InvalidValueError,
+            "one of the joints float_x",
+        ),
         (lambda chart: oc.Problem(chart.problem.robot, chart.problem.task), MetricError, "expected 'inertia'"),
     ],
 )

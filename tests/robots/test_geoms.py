@@ -121,7 +121,7 @@ def test_locked_joints_and_what_cannot_be_read_are_said(tmp_path: Path) -> None:
     )
     with pytest.raises(RobotError, match="no geom that can collide"):
         _ = oc.Robot.from_mjcf(bare).collisions
-    with pytest.raises(RobotError, match="expected a URDF file with it"):
+    with pytest.raises(RobotError, match="expected a URDF file"):
         _ = robot.with_solids(path, path).collisions
     model = oc.Robot.from_mjcf(mujoco.MjModel.from_xml_path(str(path)), "tip")
     with pytest.raises(RobotError, match="URDF or MJCF file"):

@@ -199,7 +199,7 @@ def test_law_on_mimic_joints_follows_a_step_and_agrees_in_c(robot: oc.Robot, tmp
     generated = oc.generate_c(chart, tmp_path / "c", law)
     assert max(check_c(generated, chart, law, states=50).differences.values()) < 1e-9
     # body poses and distances that C takes along the tree know no mimic joints
-    with pytest.raises(RobotError, match="distances in C: not possible with mimic joints, and 'j3' mimics 'j2'"):
+    with pytest.raises(RobotError, match="distances in C: not possible with mimic joints; here 'j3' mimics 'j2'"):
         oc.generate_c(chart, tmp_path / "d", law, capsules=fit_capsules(robot.collisions))
 
 

@@ -157,9 +157,12 @@ def test_xacro_files_without_xacro_say_what_to_install(tmp_path: Path, monkeypat
         ('<robot name="a"/>', "is not a usable URDF model: No link elements found in urdf file$"),
         (
             f'<robot name="a" {XACRO}><xacro:include filename="b"/></robot>',
-            "is a xacro file, expected URDF: name it .xacro",
+            "is a xacro file, expected URDF: if you trust it, rename it to .xacro",
         ),
-        ('<robot name="a"><link name="${prefix}b"/></robot>', "is a xacro file, expected URDF: name it .xacro"),
+        (
+            '<robot name="a"><link name="${prefix}b"/></robot>',
+            "is a xacro file, expected URDF: if you trust it, rename it to .xacro",
+        ),
         (f'<robot name="a" {XACRO}><link name="b"/><xacro:arm/></robot>', "no movable joint"),
     ],
 )

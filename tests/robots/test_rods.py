@@ -97,7 +97,7 @@ WRONG: dict[str, tuple[Callable[[], object], str]] = {
     "radius of a sphere": (lambda: Sphere([0, 0, 0], 0.0), "radius is 0.0, expected a length above 0"),
     "centre": (lambda: Sphere([0, 0], 1.0), r"centre has shape \(2,\), expected \(3,\)"),
     "end of a capsule": (lambda: Capsule([0, 0, 0], [0, np.nan, 0], 1.0), r"end\[1\] is nan"),
-    "normal": (lambda: Plane([0, 0, 0], [0, 0, 0]), "normal is .*, expected a direction"),
+    "normal": (lambda: Plane([0, 0, 0], [0, 0, 0]), "normal is .*, expected a vector longer"),
     "radii": (lambda: rods(np.ones(2)), "radius is an array of shape"),
     "negative radius": (lambda: rods(-1.0), "expected lengths above 0"),
 }

@@ -209,7 +209,7 @@ def test_a_stack_of_stacks_is_a_stack(baxter: oc.Robot) -> None:
 @pytest.mark.parametrize(
     ("tip", "tips", "message"),
     [
-        (LEFT, [RIGHT], "none beside tip"),
+        (LEFT, [RIGHT], "nothing, because tip is given"),
         (None, [LEFT, LEFT], "different names"),
         (None, "left_gripper", "different names"),
         (None, [LEFT, "tail"], "unknown frame 'tail'"),

@@ -136,7 +136,7 @@ PUSH = {"start": 1, "duration": 0.1, "force": [1, 0, 0]}
         (changed(STEPS, steps=[{"time": 1, "to": {"y": 1}}]), "steps[0].to has an unknown quantity 'y', known: x, xi1"),
         (changed(STEPS, steps=[{"time": 1, "to": [1]}]), "steps[0].to is [1], expected an object"),
         (changed(STEPS, steps=[{"time": 1, "to": {"x": None}}]), "steps[0].to.x is missing"),
-        (changed(STEPS, steps=[{**ONE, "to": {"x": 1}}]), "steps[0] has x in 'move' and in 'to'"),
+        (changed(STEPS, steps=[{**ONE, "to": {"x": 1}}]), "steps[0] has x in both 'move' and 'to'"),
         ({"points": []}, "points is [], expected at least one point"),
         (
             {"points": [{"time": 0}]},
@@ -174,7 +174,7 @@ PUSH = {"start": 1, "duration": 0.1, "force": [1, 0, 0]}
         (changed(STEPS, pushes=[{**PUSH, "point": [1, 2]}]), "pushes[0].point is [1, 2], expected a list of 3 numbers"),
         (
             changed(STEPS, pushes=[{"start": 1, "duration": 1, "torque": [0, 0, 1], "link": 1}]),
-            "pushes[0] has a 'link' but no 'force', expected both or none of them",
+            "pushes[0] has a 'link' but no 'force', expected 'force' too, or no 'link'",
         ),
     ],
 )

@@ -120,7 +120,7 @@ def test_friction_that_no_joint_has_is_refused(slider: oc.Robot) -> None:
         StickingPlant(slider, friction=Friction(coulomb=1.0, breakaway=0.5))
     with pytest.raises(InvalidValueError, match="stribeck_speed"):
         StickingPlant(slider, friction=Friction(coulomb=1.0, stribeck_speed=0.0))
-    with pytest.raises(InvalidValueError, match="StickingPlant has it"):
+    with pytest.raises(InvalidValueError, match="only StickingPlant has"):
         MuJoCoPlant(slider, friction=Friction(coulomb=1.0, breakaway=1.5))
     with pytest.raises(ShapeError, match="torque"):
         StickingPlant(slider).step([0.0, 0.0], 1e-3)

@@ -169,7 +169,7 @@ def test_arguments_that_do_not_fit_are_named(law: PDPlus, chart: oc.Chart, monke
         simulate(law, reference, q, control_rate=RATE, safety=replace(safety, rest_speed=[0.5, 0.5]))
     projector = Projector(chart.problem, 100.0, 10.0)
     posture = Reference.steps(projector.labels, projector.measured(q).full().ravel(), [], 0.2)
-    with pytest.raises(InvalidValueError, match="without a chart"):
+    with pytest.raises(InvalidValueError, match="has no chart"):
         simulate(projector, posture, q, control_rate=RATE, safety=Safety.of(projector))
     monkeypatch.setattr(libraries.shutil, "which", lambda name: None)
     with pytest.raises(CompileError, match="no C compiler"):

@@ -141,7 +141,9 @@ def test_bad_bounds_are_refused(problem: oc.Problem) -> None:
     for bound in (0.0, -1.0, np.inf, np.nan):
         with pytest.raises(InvalidValueError, match=r"least_singular_value is .*, expected positive and finite"):
             oc.Problem(robot, task, domain=WIDE, least_singular_value=bound)
-    with pytest.raises(InvalidValueError, match="least_singular_value is 0.1, expected none with a torus"):
+    with pytest.raises(
+        InvalidValueError, match="least_singular_value is 0.1, expected no bound, because the domain is a torus"
+    ):
         oc.Problem(robot, task, domain=oc.Torus(3), least_singular_value=0.1)
     with pytest.raises(InvalidValueError, match="scale is 0"):
         oc.ClearBox(WIDE, task, 0.1, [1.0, 0.0])

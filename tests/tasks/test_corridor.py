@@ -200,10 +200,10 @@ def test_command_line_fits_along_postures(run: Run) -> None:
     assert domain.radius.tolist() == [np.inf, 0.25, 0.25]
     assert domain.contains(PATH).all()
     for others, word in (
-        (("--centre", "0,0,0"), "--corridor is a domain: leave out --centre"),
-        (("--domain", "auto"), "--corridor is a domain: leave out"),
+        (("--centre", "0,0,0"), "--corridor defines the domain: leave out --centre"),
+        (("--domain", "auto"), "--corridor defines the domain: leave out"),
         (("--half-width", "-1"), "radius"),
-        (("--half-width", "1,1,1"), "expected one number: the radius of the corridor"),
+        (("--half-width", "1,1,1"), "expected one number, which is the radius of the corridor"),
     ):
         code, out, err = run(*words, "--force", *others)
         assert (code, out) == (2, "")

@@ -258,7 +258,7 @@ def refuses_trackers(chart: oc.Chart) -> bool:
     if chart.problem.domain.name != "round":
         return False
     for nearest in (False, True):
-        with pytest.raises(DomainError, match="kind 'round' has no condition as an expression"):
+        with pytest.raises(DomainError, match="kind 'round' has no CasADi expression of its condition"):
             chart.tracker(CENTRE, nearest=nearest)
     return True
 

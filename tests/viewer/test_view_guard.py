@@ -192,7 +192,7 @@ def test_other_servers_are_not_guarded_and_an_unguarded_viser_is_closed(monkeypa
     monkeypatch.setattr("orthocas.viewer.window._VISER", "another.module")
     closed = []
     monkeypatch.setattr(window, "close_window", lambda server: (closed.append(server), server.stop()))
-    with pytest.raises(ViewError, match="can be guarded"):
+    with pytest.raises(ViewError, match="cannot be guarded"):
         oc.view(oc.Robot.planar([1.0, 1.0], [1.0, 1.0]), port=0)
     assert len(closed) == 1
 

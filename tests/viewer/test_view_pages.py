@@ -140,7 +140,7 @@ def test_a_path_plays_and_its_recording_can_be_viewed(tmp_path: Path, monkeypatc
         motion = read_joint_motion(tmp_path / "joints.csv", chart.problem.robot)
         np.testing.assert_allclose(motion.q[0], page.session.home, atol=1e-8)
         np.testing.assert_allclose(motion.q[-1], page.session.q, atol=1e-8)
-    with pytest.raises(InvalidValueError, match="a chart with it"):
+    with pytest.raises(InvalidValueError, match="a chart to show"):
         oc.view(chart.problem.robot, path=[x, x], port=0)
 
 
@@ -198,5 +198,5 @@ def test_a_page_shows_the_nearest_pair_and_red_ones_where_they_are_close(tmp_pat
             assert "link2 and ball" in content
             assert shown in content
             assert len(page._contacts._nodes) == 1 + close
-    with pytest.raises(InvalidValueError, match="a chart with it"):
+    with pytest.raises(InvalidValueError, match="a chart to show"):
         oc.view(robot, collisions=robot.collisions, port=0)

@@ -87,7 +87,7 @@ def test_wishes_are_checked() -> None:
     session = Session(fitted().chart)
     with pytest.raises(UnknownNameError, match="unknown component of phi 'xi9', known: x, xi1, xi2"):
         session.wish({"xi9": 0.0})
-    with pytest.raises(InvalidValueError, match="wish for xi1 is nan, expected a finite number"):
+    with pytest.raises(InvalidValueError, match="target for xi1 is nan, expected a finite number"):
         session.wish({"xi1": np.nan})
     with pytest.raises(NoExpressionError):
         Session(circle())
