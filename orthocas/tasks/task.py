@@ -691,9 +691,10 @@ class Task(Shown, HoldsFunctions):
 
         Args:
             pose: one pose or many: matrices (4, 4) or (N, 4, 4); an object with `translation` and `rotation`, such as
-                `pinocchio.SE3`, or a list of them; a pair of position and orientation as in `value`, or a list of pairs.
-                Rotations may be rounded to single precision or four decimals. Or task values (m,) or (N, m), which are
-                returned unchanged. A rotation matrix is refused, so that it is not mistaken for three task values.
+                `pinocchio.SE3`, or a list of them; a pair of position and orientation as in `value`, or a list of
+                pairs. Rotations may be rounded to single precision or four decimals. Or task values (m,) or (N, m),
+                which are returned unchanged. A rotation matrix is refused, so that it is not mistaken for three task
+                values.
 
         Raises:
             InvalidValueError, ShapeError: if the argument has none of these forms, or the task does not use such a

@@ -51,7 +51,8 @@ orthocas() {
 }
 """
 _BLOCK = re.compile(
-    r"(?:^<!-- (needs|sketch) ?([^\n]*) -->\n)?^```(\{code-cell\} python|python|sh)\n(.*?)^```$", re.DOTALL | re.MULTILINE
+    r"(?:^<!-- (needs|sketch) ?([^\n]*) -->\n)?^```(\{code-cell\} python|python|sh)\n(.*?)^```$",
+    re.DOTALL | re.MULTILINE,
 )
 
 
