@@ -316,8 +316,8 @@ def read_table(
     lines = _read_lines(Path(path), what)
     if not least <= len(lines) - 1 <= most:
         unnamed = lines and all(_is_number(cell) for cell in lines[0][1])
-        header = "its first line, which should name the columns" if unnamed else "the header"
-        came = f"it has {max(len(lines) - 1, 0)} {rows} after {header}"
+        first = "its first line, which should name the columns" if unnamed else "the header"
+        came = f"it has {max(len(lines) - 1, 0)} {rows} after {first}"
         raise PathFileError(f"{what} {path}: {came}, expected {least} to {most}")
     header = [cell.strip() for cell in lines[0][1]]
     try:
