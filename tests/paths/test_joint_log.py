@@ -35,7 +35,7 @@ def test_log_is_read_by_the_names_of_its_columns(chart: oc.Chart, tmp_path: Path
         ("time_s,q1,q2,q3\n0,1,1,1\n0,1,1,1\n", r"time_s is 0 after 0, expected it to rise"),
         ("time_s,q1,q2,q3\n0,1,1,1\n1,1,nan,1\n", r"line 3: q2 is 'nan', expected a number"),
         ("time_s,q1,q2,q3\n0,1,1,1\n", r"it has 1 instants after the header, expected 2 to 1000000"),
-        ("0,1,1,1\n0.1,1,1,1\n", r"after its first line, which should name the columns"),
+        ("0,1,1,1\n0.1,1,1,1\n", r"it has 1 instants after its first line, which should name the columns"),
     ],
 )
 def test_broken_logs_name_file_and_line(text: str, message: str, chart: oc.Chart, tmp_path: Path) -> None:
