@@ -50,7 +50,7 @@ def compare(first: Collisions, second: Collisions, q: Array) -> None:
 def test_charts_carry_solids(arm: tuple[oc.Chart, Collisions], tmp_path: Path) -> None:
     chart, model = arm
     chart.save(tmp_path / "bare.orthocas")
-    with pytest.raises(RobotError, match="nothing is known"):
+    with pytest.raises(RobotError, match="the links have no solids"):
         _ = oc.load(tmp_path / "bare.orthocas").robot.collisions
     chart.save(tmp_path / "a.orthocas", collisions=model)
     loaded = oc.load(tmp_path / "a.orthocas")

@@ -251,7 +251,7 @@ PANDA = str(robot_data("panda_description/urdf/panda.urdf"))
         (["fit", "iiwa", "--colour"], "No such option"),
         (["fly"], "No such command"),
         (["evaluate", "nothing.orthocas"], "chart file nothing.orthocas does not exist"),
-        (["evaluate", PANDA], "not a chart file"),
+        (["evaluate", PANDA], "expected a chart file"),
         (["info", "nothing"], "unknown problem or robot 'nothing', known: "),
         (["info", "nothing.orthocas"], "does not exist"),
     ],

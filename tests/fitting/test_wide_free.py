@@ -40,7 +40,7 @@ def test_only_free_postures_count(tmp_path: Path) -> None:
 
 def test_robots_without_solids_or_free_postures_are_refused(tmp_path: Path) -> None:
     bare = oc.Robot.planar([1.0, 1.0, 1.0], [1.0, 1.0, 1.0])
-    with pytest.raises(RobotError, match="nothing is known"):
+    with pytest.raises(RobotError, match="the links have no solids"):
         oc.fit_wide(bare, oc.Task.position(bare, "xy"), BENT, collisions=True)
     huge = build_arm(tmp_path, ['<sphere radius="9"/>', "", "", BALL])
     model = huge.collisions
