@@ -3,7 +3,7 @@
 `arm.Arm` holds a task with r = 1 and charts of branches. `kernel` finds the self-motion curves of a task value, in
 compiled C, from stored postures. `self_motion` cuts them at joint limits, and answers questions about them.
 `chart_kernel` compiles the search for postures with x and xi, and the tracker, which `tracker` calls. `maps` holds
-what all of these need of robot and task, and reads task values as people hold them.
+the data of robot and task that all of these need, and reads task values in all accepted forms.
 """
 
 from orthocas.arms.arm import Arm, Postures

@@ -50,7 +50,7 @@ from orthocas.tools.files import make_folder, publish
 from orthocas.tools.progress import Monitor, Progress, silent
 from orthocas.version import VERSION
 
-ANY = "any"  #: branch
+ANY = "any"  #: name that stands for all branches
 
 
 _DATA = files(__package__) / "data"
@@ -58,16 +58,16 @@ _WIDE = "-wide"  # ends the names of ready charts that an arm can have
 
 
 def list_arms() -> tuple[str, ...]:
-    """Names of the arms that `Arm.load` knows: those of the ready wide charts."""
+    """Names of the arms that `Arm.load` knows; each has a ready wide chart."""
     return tuple(name.removesuffix(_WIDE) for name in names() if name.endswith(_WIDE))
 
 
 @dataclass(frozen=True, slots=True)
 class ArmRules:
-    """Numbers of an arm's answers."""
+    """Settings of an arm's searches."""
 
-    spacing: float = 0.05  #: [rad] or [m] between postures of an arc among which free ones are sought, or a branch's
-    postures: int = 100_000  #: of a chart, in generated C
+    spacing: float = 0.05  #: distance of postures on an arc that are checked for contacts or branches [rad] or [m]
+    postures: int = 100_000  #: largest number of stored postures of a chart in generated C
 
 
 RULES = ArmRules()
@@ -75,12 +75,12 @@ RULES = ArmRules()
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Postures(Shown):
-    """Joint positions with given task values; of `Arm.solve` for one value, or of several in rows."""
+    """Joint positions with given task values, from `Arm.solve`: for one value, or for several in rows."""
 
     q: Array  #: (n,) or (N, n), within the joint limits; NaN where none was found
-    status: Any  #: `InverseStatus`, or (N,) of its numbers; with NEAREST and OUTSIDE_DOMAIN, x alone is met
-    branch: Any  #: name of the branch, or a tuple of names; "" on none
-    xi: Array  #: of the branch's chart, () or (N,); NaN outside its domain
+    status: Any  #: `InverseStatus`, or its numbers (N,); with NEAREST and OUTSIDE_DOMAIN, only x is met
+    branch: Any  #: name of the branch, or a tuple of names; "" if on no branch
+    xi: Array  #: coordinate in the branch's chart, () or (N,); NaN outside its domain
 
     def __len__(self) -> int:
         return len(np.atleast_2d(self.q))
@@ -105,7 +105,7 @@ class Postures(Shown):
 class Arm(Shown):
     """An arm with more joints than its task needs, and charts of the branches of its joint range.
 
-    Where a chart ends at a boundary of its domain, an arm goes on: it knows the postures of a task value x within the
+    A chart ends at the boundary of its domain, but an arm knows all postures of a task value x within the
     joint limits. Without limits they are a few closed curves, which are traced from stored postures and then cut at
     the limits: `self_motion` and `solve`. Charts give postures a number xi on each branch.
     `tracker` follows a stream of x and xi through borders of charts, singular positions and out of reach. Arms with
@@ -147,14 +147,14 @@ class Arm(Shown):
         free = robot.n - len(robot.tree.floating)
         if self.task.m >= free:
             raise NotRedundantError(self.task.m, free)
-        # Turns of a joint are counted from a limit to the other one, so one limit alone is none.
+        # Turns of a joint are counted from one limit to the other, so a revolute joint with one limit is refused.
         one = np.flatnonzero(np.isfinite(robot.lower) != np.isfinite(robot.upper))
         if any(not robot.tree.prismatic[k] for k in one):
             raise InvalidValueError("joint", f"'{robot.joint_names[one[0]]}' with one limit", "two limits, or none")
         object.__setattr__(self, "task", self.task.with_reference_at(find_joint_range(robot, 0).centre))
         if not isinstance(self.charts, tuple | list):
             raise InvalidValueError("charts", repr(self.charts)[:80], "a tuple of charts")
-        # All charts and the arm speak of the same x.
+        # All charts and the arm must have the same x.
         for chart in self.charts:
             require_kind("charts", chart, Chart)
             same = chart.problem.task.recipe == self.task.recipe
@@ -182,12 +182,12 @@ class Arm(Shown):
             robot: the robot.
             task: its task, with m = n - 1. Default: the pose of the tip.
             metric: as in `Problem`.
-            seed: of samples.
+            seed: random seed of samples.
             monitor: called with progress.
 
         Raises:
             NotRedundantError, InvalidValueError: if n - m is not 1.
-            DomainError: if no branch can be fitted. Of single branches that cannot, a BranchWarning says so.
+            DomainError: if no branch can be fitted. If only some cannot, a BranchWarning names them.
         """
         require_kind("robot", robot, Robot)
         bare = cls(Task.pose(robot) if task is None else task)
@@ -221,7 +221,7 @@ class Arm(Shown):
             UnknownNameError: for a word that is neither a file nor the name of a known arm.
             ChartFileError: if the file is missing, truncated, foreign, edited, or from a newer version.
         """
-        # A word without a folder or an ending is the name of a known arm.
+        # A name without a folder or an ending is that of a known arm.
         file = as_path("path", path)
         if not (file.exists() or file.suffix or len(file.parts) > 1):
             require_known("arm file or known arm", file.name, list_arms())
@@ -293,8 +293,8 @@ class Arm(Shown):
         posture whose xi is nearest is NEAREST; where charts hold none, one with that x within the limits is
         OUTSIDE_DOMAIN. Without xi, it is the posture nearest to the start, or without one, far from limits.
 
-        Where full turns of joints without limits change xi, those within one and a half turns of the start count, or of
-        the centre of the domain.
+        If full turns of joints without limits change xi, only postures within one and a half turns of the start, or of
+        the centre of the domain, are returned.
 
         Rows are spread over the cores, in C that is compiled on first use.
 
@@ -324,7 +324,7 @@ class Arm(Shown):
             require_known("branch", branch, self.branch_names)
         if all:
             return self._solve_all(x, xi, start, branch, collisions)
-        # What was asked: targets, starts, charts that may answer, and xi.
+        # Read the request: targets, starts, charts that may answer, and xi.
         targets, single = self._read(x)
         N, n = len(targets), self.robot.n
         starts = None if start is None else _repeat_rows("start", as_point_set("start", start, n)[0], N)
@@ -355,7 +355,7 @@ class Arm(Shown):
             if branch != ANY:
                 beyond = status == InverseStatus.OUTSIDE_DOMAIN
                 q[beyond], status[beyond] = np.nan, InverseStatus.NOT_FOUND
-        # Where the answer touches something, a free posture takes its place.
+        # Replace postures that touch something by free ones.
         if collisions is not None:
             known = np.flatnonzero(np.isfinite(q).all(axis=1))
             for row in known[~collisions.check_free(q[known])].tolist():
@@ -414,13 +414,13 @@ class Arm(Shown):
             period: time from one call to the next [s].
             velocity_limits: (n,) or one number [rad/s] or [m/s]. Default: those of the robot's file.
             acceleration_limits: (n,) or one number [rad/s^2] or [m/s^2]. Default: none.
-            weights: of the joints' steps, and ways back to the last posture with a chart, or where there are no charts,
-                to q: (n,), of which the ratios count. A large one keeps a base nearer to its place than the arm.
+            weights: weights (n,) of the joints' steps, and of the return to the last posture with a chart, or without
+                charts, to q. Only their ratios matter. A large weight of the base makes it move less than the arm.
             detours: whether the arm may leave x for a while where it is stuck, to get to a posture that has it, or to
                 one that has xi as well.
             collisions: of the robot, such as `robot.collisions`; with margin and avoid as in `Chart.tracker`.
-            margin: [m].
-            avoid: [m].
+            margin: distance at which the arm brakes [m].
+            avoid: distance below which pairs are pushed apart [m].
         """
         clearance = Clearance.build(collisions, self.robot.tree, margin, avoid)
         rules = velocity_limits, acceleration_limits, weights, detours, clearance
@@ -442,8 +442,8 @@ class Arm(Shown):
 
         Args:
             path: N task values.
-            xi: of each, (N,), or one number; None holds that of the first posture as far as it can be had.
-            q: where the arm is before, (n,).
+            xi: coordinate for each task value, (N,), or one number; None keeps xi of the first posture where possible.
+            q: posture of the arm before the first call, (n,).
             period: as in `tracker`.
             velocity_limits: as in `tracker`.
             collisions: as in `tracker`.
@@ -479,8 +479,8 @@ class Arm(Shown):
         Args:
             folder: created if its parent exists.
             name: prefix of all C names.
-            postures: stored for each chart, and once more for all of the joint range; searches for another way try
-                24 of them, one a call.
+            postures: number of stored postures for each chart, and for the whole joint range. Searches for another way
+                try 24 of them, one a call.
             force: also replace files of these names that were not generated.
 
         Returns:
@@ -527,7 +527,7 @@ class Arm(Shown):
 
     @cached_property
     def maps(self) -> ArmMaps:
-        """What other files of this package use of an arm; it may change without notice."""
+        """Data of the arm for other files of this package; it may change without notice."""
         return ArmMaps(self.task)
 
     @cached_property
@@ -580,7 +580,7 @@ class Arm(Shown):
             domains = [self.charts[k].problem.domain for k in chosen]
 
             def solve_row(row: int) -> None:
-                # the best of postures 0.05 rad apart on the arcs that lie in one of the domains
+                # Take the best of the postures 0.05 rad apart on the arcs that lie in one of the domains.
                 start = None if starts is None else starts[row]
                 places = self._spread_postures(targets[row], start)
                 inside = np.vstack([self._find_inside(places, domain) for domain in domains])
@@ -598,7 +598,7 @@ class Arm(Shown):
         return np.vstack([np.empty((0, self.robot.n)), *q])
 
     def _find_inside(self, q: Array, domain: Domain) -> Array:
-        """Those of postures (N, n) that a domain holds, after full turns of joints without limits into its box."""
+        """The postures among q (N, n) in a domain, after full turns of joints without limits into its box."""
         bounded = np.isinf(self.robot.lower) & np.isfinite(domain.bounds[0]) & self.maps.turning
         moved = domain.home + wrap_shortest(q - domain.home, np.where(bounded, 2 * np.pi, 0.0))
         return np.asarray(moved[np.asarray(domain.contains(moved))])
@@ -613,7 +613,7 @@ class Arm(Shown):
         collisions: Collisions,
     ) -> tuple[Array, InverseStatus] | None:
         """A posture of one target without a contact, of those with xi or of many on its arcs; None if there is none."""
-        # With xi: those that have it exactly, and are free.
+        # With xi, first look for free postures that have it exactly.
         if xi is not None:
             exact = self.chart_kernel.solve_all(target, xi, start, chosen)[0]
             exact = exact[collisions.check_free(exact)] if len(exact) else exact
@@ -621,7 +621,7 @@ class Arm(Shown):
                 return exact[
                     0 if start is None else np.linalg.norm(exact - start, axis=1).argmin()
                 ], InverseStatus.FOUND
-        # Otherwise, of free postures on the arcs ...
+        # Otherwise, collect free postures on the arcs.
         q = self._spread_postures(target, start)
         q = q[collisions.check_free(q)] if len(q) else q
         owners = np.zeros(len(q), dtype=np.int64)
@@ -630,7 +630,7 @@ class Arm(Shown):
             q, owners = np.vstack(parts), np.repeat(chosen, [len(part) for part in parts])
         if not len(q):
             return None
-        # ... that with the nearest xi, or without xi, that nearest to the start.
+        # Choose the posture with the nearest xi; without xi, nearest to the start, or farthest from limits.
         if xi is not None:
             periods = np.array([self.charts[k].parts.turns[self.charts[k].m] for k in owners])
             away = np.abs(wrap_shortest(self._evaluate_xi(q, owners) - xi, periods))
@@ -638,7 +638,7 @@ class Arm(Shown):
         return q[self._choose(q, start)], InverseStatus.FOUND
 
     def _choose(self, q: Array, start: Array | None) -> int:
-        """The number of the posture nearest to a start, or without one, farthest from the limits, in half-widths."""
+        """Index of the posture nearest to a start; without a start, farthest from the limits, in half-widths."""
         if start is not None:
             return int(np.argmin(np.linalg.norm(q - start, axis=1)))
         low, high = self.robot.lower, self.robot.upper
@@ -657,7 +657,7 @@ class Arm(Shown):
 
 
 def _repeat_rows(name: str, rows: Array, count: int) -> Array:
-    """Rows (count, k), of so many or of one for all."""
+    """Rows (count, k), from as many rows or from one row for all."""
     if len(rows) not in (1, count):
         raise ShapeError(name, rows.shape, (count, rows.shape[1]))
     return np.broadcast_to(rows, (count, rows.shape[1]))

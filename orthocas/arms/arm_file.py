@@ -11,11 +11,11 @@ from orthocas.tools.archive import Kind, read_archive, require_free, write_archi
 from orthocas.tools.files import is_archive, open_draft_folder, write_temporary
 
 ARM = Kind("arm", 1, ChartFileError)
-_MOST = 256  # charts of an arm
+_MOST = 256  # largest number of charts of an arm
 
 
 def is_arm(path: Path) -> bool:
-    """Whether a file says that it is an arm file."""
+    """Whether a file is marked as an arm file."""
     return is_archive(path, ARM.format)
 
 

@@ -21,11 +21,11 @@ _FLAGS = ("-O3",)
 
 @dataclass(frozen=True, eq=False)
 class Curve:
-    """A self-motion curve: points in order, between which it is a cubic, and what limits do to it."""
+    """A self-motion curve: points in order, a cubic between neighbouring points, and its crossings of limits."""
 
-    q: Array  #: (P, n), unwrapped; of a closed curve the last is the first, up to full turns
+    q: Array  #: points (P, n), unwrapped; on a closed curve, the last equals the first up to full turns
     tangent: Array  #: unit tangents (P, n), with det [J; t] > 0
-    length: Array  #: of the curve from each point to the next, (P,); 0 at the last
+    length: Array  #: arc length from each point to the next, (P,); 0 at the last
     closed: bool
     crossings: NDArray[Any]  #: records `crossing_type` in order along the curve
 
@@ -41,7 +41,7 @@ class Curve:
         q, t = evaluate_cubic(
             self.q[k], self.q[k + 1], self.tangent[k], self.tangent[k + 1], h, (place - self.places[k]) / h
         )
-        # At a crossing, the exact posture takes the place of that on the cubic.
+        # At a crossing, use its exact posture instead of the point on the cubic.
         at = np.flatnonzero(self.crossings["place"] == place)
         return (self.crossings["q"][at[0]] if at.size else q), t
 
@@ -60,14 +60,14 @@ def evaluate_cubic(
 class StoredPostures:
     """Random postures within the limits, in the order of the branches, and where they are in x.
 
-    Those near a value of x are taken by |x - x_d|^2 det(J J^T)^(-1/m): then each self-motion curve gets a part of them
-    like its part of the length of all curves, whatever its distance from singular positions.
+    Starts for a value x_d are the postures with the least |x - x_d|^2 det(J J^T)^(-1/m). Each self-motion curve then
+    gets starts in proportion to its length, whatever its distance from singular positions.
     """
 
     q: Array  #: (S, n)
     places: NDArray[np.float32]  #: (k, S): distances between them are errors of x
-    weights: NDArray[np.float32]  #: of squared distances, (S,)
-    begins: NDArray[np.intc]  #: numbers of the first posture of each branch, and S
+    weights: NDArray[np.float32]  #: weights of squared distances, (S,)
+    begins: NDArray[np.intc]  #: index of the first posture of each branch, then S
 
 
 def crossing_type(n: int) -> np.dtype[Any]:
@@ -161,7 +161,7 @@ class CurveKernel:
         return q
 
     def correct(self, target: Array, q: Array, tangent: Array) -> NDArray[np.bool_]:
-        """Bring points q (K, n) to their curve across tangents (K, n), both in place; where that succeeds, (K,)."""
+        """Bring points q (K, n) to their curve across tangents (K, n), both in place; return successes, (K,)."""
         good = np.empty(len(q), dtype=np.bool_)
         self._c.correct_rows(pointer(target), len(q), pointer(q), pointer(tangent), pointer(good))
         return good
@@ -193,8 +193,8 @@ def build_equations(task: Task, scale: Array) -> ca.Function:
     """q (n, 1), target -> e (m, 1) and J (m, n), both divided by the scale; d(e)/dt = -J dq at e = 0.
 
     For tasks of a whole orientation, the target is the position, if the task has one, and the rotation (3, 3) by
-    columns; e is the rotation vector to it in the axes of the task's frame, and J the geometric Jacobian. Others
-    compare values of x.
+    columns; e is the rotation vector to it in the axes of the task's frame, and J the geometric Jacobian. Other
+    tasks compare values of x.
     """
     robot, turn = task.robot, task.turn
     q = ca.SX.sym("q", robot.n)
@@ -217,7 +217,7 @@ def build_equations(task: Task, scale: Array) -> ca.Function:
 
 
 def build_curvature(equations: ca.Function) -> ca.Function:
-    """q (n, 1), target -> the second derivative of |e|^2 / 2, (n, n): that of J and e of `build_equations`."""
+    """q (n, 1), target -> the second derivative of |e|^2 / 2, (n, n), with e from `build_equations`."""
     q, target = (ca.SX.sym(name, equations.size1_in(i)) for i, name in enumerate(("q", "target")))
     e, J = equations(q, target)
     # The gradient of |e|^2 / 2 is -J^T e.

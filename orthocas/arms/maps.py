@@ -1,4 +1,4 @@
-"""What every part of an arm needs of its robot and task, built on first use, and task values as people hold them."""
+"""Data of robot and task that all parts of an arm need, built on first use, and a reader of task values."""
 
 from __future__ import annotations
 
@@ -30,10 +30,10 @@ class MapRules:
 
     scaled: int = 2000  #: postures from which the lengths of rows of J are taken
     stored: int = 20_000  #: postures from which searches start
-    seed: int = 0  #: of them
-    least_volume: float = 1e-12  #: det(J J^T) of postures that count as singular
-    shifted: int = 16  #: postures at which a rail shifts x alike
-    same: float = 1e-9  #: of such shifts [m], by a metre of the rail
+    seed: int = 0  #: random seed of these postures
+    least_volume: float = 1e-12  #: smallest det(J J^T) that is used in a weight; smaller values are raised to it
+    shifted: int = 16  #: postures at which the shift of x by a rail is compared
+    same: float = 1e-9  #: largest difference of such shifts that counts as none [m], for a metre of the rail
     no_rotation: float = 1e-8  #: sum of squares above that of rotations: vectors longer than half a turn by 1e-9
 
 
@@ -53,7 +53,7 @@ class ArmMaps:
 
     @cached_property
     def scale(self) -> Array:
-        """What components of errors are divided by, (m,): 1 for angles, else how far a joint moves them, per radian."""
+        """Divisors of the components of errors, (m,): 1 for angles, else how far a radian of a joint moves them."""
         # Lengths of the rows of J for revolute joints, at even postures; one for each unit, such as all positions.
         whole = find_joint_range(self.robot, 0)
         q = sample_evenly(Box(whole.centre, whole.half_width), RULES.scaled, 0)
@@ -87,9 +87,9 @@ class ArmMaps:
 
     @cached_property
     def place_sizes(self) -> Array:
-        """A target divided by these is a place: distances of places are errors of x, as of `equations`, (k,).
+        """A target divided by these is a place: distances of places are errors of x as in `equations`, (k,).
 
-        They are infinite for what a rail without limits makes up for, wherever the arm stands.
+        A divisor is infinite if a rail without limits can correct that component at all postures.
         """
         sizes = self.scale
         if self.turned:
@@ -117,14 +117,14 @@ class ArmMaps:
         # Others may wait for this value, so no other threads take part.
         with use_threads(1):
             robot, whole, rng = self.robot, find_joint_range(self.robot, 0), np.random.default_rng(RULES.seed)
-            # Small arms with slides are nowhere clear in units of [rad] and [m], and have curves all the same.
+            # `branches` may refuse small arms with slides as singular, but these arms still have curves.
             try:
                 parts: Sequence[Branch] = branches(robot, self.task)
             except SingularTaskError:
                 parts = ()
             low, high = whole.centre - whole.half_width, whole.centre + whole.half_width
             q = rng.uniform(low, high, (RULES.stored, robot.n))
-            # In the order of branches; postures of none come last.
+            # Sort by branch; postures outside all branches come last.
             own = np.full(len(q), len(parts))
             for k, branch in enumerate(parts):
                 own[np.asarray(branch.box.contains(q))] = k
@@ -147,7 +147,7 @@ class ArmMaps:
 
     @cached_property
     def stops(self) -> tuple[tuple[Stop, Stop], ...]:
-        """What the lowest and the highest position of each joint is to a motion."""
+        """The stops of a motion at the lowest and the highest position of each joint."""
         robot = self.robot
         return tuple(
             (Stop(StopKind.JOINT, name, float(low), True), Stop(StopKind.JOINT, name, float(high), True))
@@ -166,12 +166,12 @@ class ArmMaps:
         return ~np.array(self.robot.tree.prismatic)
 
     def find_curves(self, target: Array, *starts: Array) -> list[Curve]:
-        """The curves of a target (k,), from starts (S, n) of one's own and from stored postures."""
+        """The curves of a target (k,), from given starts (S, n) and from stored postures."""
         near = self.kernel.choose_starts(self.stored, target / self.place_sizes)
         return self.kernel.find_curves(target, np.ascontiguousarray(np.vstack([*starts, near])))
 
     def choose_postures(self, targets: Array, starts: Array | None) -> Array:
-        """Postures (N, n) of targets (N, k), as of the kernel."""
+        """Postures (N, n) of targets (N, k), as `CurveKernel.choose_postures` finds them."""
         return self.kernel.choose_postures(targets, starts, self.stored, targets / self.place_sizes)
 
     def evaluate(self, q: Array, targets: Array) -> tuple[Array, Array]:
@@ -221,10 +221,10 @@ class TargetReader:
         A single pose with NaN is a target of NaN.
 
         Raises:
-            ShapeError, InvalidValueError: if x is none of what the task can have.
+            ShapeError, InvalidValueError: if x is not a value of the task.
         """
         m = self.task.m
-        # Poses with NaN, which a broken sensor sends, are a target that trackers answer with BAD_INPUT.
+        # A broken sensor may send poses with NaN. They become targets that trackers answer with BAD_INPUT.
         try:
             values = self.task.target(x)
         except InvalidValueError:
@@ -251,11 +251,11 @@ class TargetReader:
         return targets
 
     def lack_rotation(self, targets: Array) -> NDArray[np.bool_]:
-        """Which targets (N, k) are of vectors beyond half a turn, which no rotation has, (N,)."""
+        """Whether each target (N, k) comes from a vector beyond half a turn, which no rotation has, (N,)."""
         turn = self.task.turn
         if turn is None or not turn.whole:
             return np.zeros(len(targets), dtype=bool)
-        # There the formula of Rodrigues gives no rotation, but a matrix with a larger sum of squares.
+        # Beyond half a turn, Rodrigues' formula gives no rotation, but a matrix with a larger sum of squares.
         return np.asarray((targets[:, -9:] ** 2).sum(axis=1) > 3 + RULES.no_rotation)
 
     def vector(self, targets: Array) -> Array:
@@ -272,7 +272,7 @@ class TargetReader:
 
 
 def _is_pose_with_nan(x: Any) -> bool:
-    """Whether x is one pose of which a number is not finite."""
+    """Whether x is one pose with a number that is not finite."""
     parts = (x.translation, x.rotation) if hasattr(x, "rotation") and hasattr(x, "translation") else x
     parts = parts if isinstance(parts, tuple) and len(parts) == 2 else (parts,)
     try:
