@@ -419,8 +419,8 @@ class Arm(Shown):
             detours: whether the arm may leave x for a while where it is stuck, to get to a posture that has it, or to
                 one that has xi as well.
             collisions: of the robot, such as `robot.collisions`; with margin and avoid as in `Chart.tracker`.
-            margin: distance at which the arm brakes [m].
-            avoid: distance below which pairs are pushed apart [m].
+            margin: distance to a contact that no call falls below [m]. Default: 0.01.
+            avoid: distance below which xi gives way [m], above the margin. Default: it does not.
         """
         clearance = Clearance.build(collisions, self.robot.tree, margin, avoid)
         rules = velocity_limits, acceleration_limits, weights, detours, clearance

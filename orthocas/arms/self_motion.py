@@ -30,18 +30,18 @@ _TURN = 2 * np.pi
 
 @dataclass(frozen=True, slots=True)
 class ArcRules:
-    """Numbers of questions about arcs. Lengths are in [rad] or [m]."""
+    """Settings of searches on arcs. Lengths are in [rad] or [m]."""
 
-    parts: int = 4  #: points on each step, among which the nearest is sought
-    candidates: int = 3  #: of them that are refined
-    refinements: int = 12  #: of a place, at most
+    parts: int = 4  #: points on each step that are searched for the nearest
+    candidates: int = 3  #: largest number of these points that are refined
+    refinements: int = 12  #: largest number of refinements of a place
     refined: float = 1e-10  #: change of a place that ends its refinement
-    largest: float = 0.2  #: of its changes, and distance between candidates that are different
-    least_slope: float = 0.1  #: of half the squared distance, along an arc, by a secant
-    most: int = 1_000_000  #: postures of a sample
-    spacing: float = 0.05  #: of postures at which a function is evaluated
+    largest: float = 0.2  #: largest change of a place, and least distance between candidates
+    least_slope: float = 0.1  #: least secant slope of the derivative of half the squared distance along an arc
+    most: int = 1_000_000  #: largest number of postures of a sample
+    spacing: float = 0.05  #: distance of postures at which a function is evaluated
     golden: int = 40  #: steps of golden-section search for a maximum
-    metric_spacing: float = 0.02  #: of postures between which the length in a metric is summed
+    metric_spacing: float = 0.02  #: distance of postures between which the length in a metric is summed
 
 
 RULES = ArcRules()
@@ -49,20 +49,20 @@ RULES = ArcRules()
 
 @dataclass(frozen=True, slots=True)
 class MergeRules:
-    """Numbers of the search for the way on which two components join."""
+    """Settings of the search for a way that joins two components."""
 
-    images: int = 31  #: postures of the way, at least
-    spacing: float = 0.1  #: between them, at most [rad] or [m]
-    parts: int = 16  #: of the way from each to the next, at which errors are measured
-    rounds: int = 400  #: of the search, at most
-    step: float = 0.3  #: of a Gauss-Newton step towards x that a posture goes, across the way
-    longest: float = 0.05  #: of the steps
-    damping: float = 1e-2  #: of these steps, relative to the trace of J J^T
-    pairs: int = 40  #: rounds of the search for a gap, at most
-    near: float = 0.2  #: relative difference of errors of a pass and of the highest posture of the way
-    away: float = 1.0  #: between these two
-    flat: float = 1e-4  #: curvature, relative to the largest, that counts as none
-    settled: float = 1e-7  #: relative change of the largest error that ends it
+    images: int = 31  #: least number of postures of the way
+    spacing: float = 0.1  #: largest distance between these postures [rad] or [m]
+    parts: int = 16  #: points from each posture to the next at which errors are measured
+    rounds: int = 400  #: largest number of rounds of the search
+    step: float = 0.3  #: fraction of a Gauss-Newton step towards x, across the way, that a posture takes
+    longest: float = 0.05  #: largest length of these steps [rad] or [m]
+    damping: float = 1e-2  #: damping of these steps, relative to the trace of J J^T
+    pairs: int = 40  #: largest number of rounds of the searches for a gap and for a pass
+    near: float = 0.2  #: largest relative difference between the errors of a pass and of the worst posture of the way
+    away: float = 1.0  #: largest distance between these two [rad] or [m]
+    flat: float = 1e-4  #: curvature, relative to the largest, below which it counts as none
+    settled: float = 1e-7  #: relative change of the largest error, or of a gap, that ends a search
 
 
 MERGE = MergeRules()
@@ -80,13 +80,13 @@ class Place(NamedTuple):
     """A posture on an arc."""
 
     q: Array  #: (n,)
-    value: float  #: what was asked for there: the distance, or the value of a function
-    component: int  #: number of the arc in `SelfMotions.components`
+    value: float  #: distance to the wished posture [rad] or [m], or value of the function
+    component: int  #: index of the arc in `SelfMotions.components`
     place: float  #: length of the arc up to there [rad] or [m]
 
 
 class Gap(NamedTuple):
-    """The least distance of two components, and where they are so near."""
+    """The least distance of two components, and the two postures that have it."""
 
     value: float  #: |q_a - q_b| [rad] or [m]
     first: Place
@@ -94,11 +94,11 @@ class Gap(NamedTuple):
 
 
 class Merge(NamedTuple):
-    """A way from one component to another, which leaves x as little as was found."""
+    """A way from one component to another, with the least deviation from x that was found."""
 
     value: float  #: largest error of x on the way, straight between postures [rad], or as far as a radian moves x
-    q: Array  #: the posture there (n,); with its value of x, the two components meet, or a limit is in the way
-    x: Array  #: that value of x (m,)
+    q: Array  #: posture with the largest error (n,); for its value of x, the components meet, or a limit separates them
+    x: Array  #: value of x at `q`, (m,)
     way: Array  #: postures (P, n) from one component to the other
 
 
@@ -111,10 +111,10 @@ class Arc(Shown):
     """
 
     maps: ArmMaps
-    target: Array  #: of the task, as the kernel takes it
-    curve: Curve  #: of which the arc is a part
-    pieces: tuple[Piece, ...]  #: one after the other
-    ends: tuple[Stop, Stop]  #: what stops it at its begin and its end
+    target: Array  #: task value, as the kernel takes it
+    curve: Curve  #: curve that contains the arc
+    pieces: tuple[Piece, ...]  #: parts of the curve in order along the arc
+    ends: tuple[Stop, Stop]  #: what stops the motion at the begin and at the end of the arc
     closed: bool
 
     @property
@@ -128,7 +128,7 @@ class Arc(Shown):
         return self.at(self._nodes[2])
 
     def at(self, place: ArrayLike) -> Array:
-        """Postures at lengths from the begin, one (n,) or several (P, n); beyond the ends, those of the ends.
+        """Postures at lengths from the begin, one (n,) or several (P, n); beyond an end, the posture at that end.
 
         Args:
             place: lengths [rad] or [m].
@@ -153,11 +153,11 @@ class Arc(Shown):
         return np.clip(q, self.maps.robot.lower, self.maps.robot.upper), t
 
     def sample(self, n: int, metric: Metric | MetricSpec = "euclidean") -> Array:
-        """Postures at equal distances along the arc, (n, joints), both ends among them; of a closed arc only one.
+        """Postures at equal distances along the arc, (n, joints), with both ends; a closed arc has its start once.
 
         Args:
             n: their number.
-            metric: in which distances count: "euclidean", "inertia", a matrix, or a function, as of a `Problem`.
+            metric: metric of the distances: "euclidean", "inertia", a matrix, or a function, as in `Problem`.
         """
         require_count("n", n, least=2, most=RULES.most)
         known = metric if isinstance(metric, Metric) else Metric.from_spec(self.maps.robot, metric)
@@ -172,7 +172,7 @@ class Arc(Shown):
         return self.at(places)
 
     def facts(self) -> dict[str, str]:
-        """Length, ends, and what stops it there."""
+        """Length of the arc, and what stops the motion at its ends."""
         if self.closed:
             return {"arc": f"closed, of length {self.length:.4g}"}
         begin, end = (str(stop) for stop in self.ends)
@@ -192,7 +192,7 @@ class Arc(Shown):
         parts: list[tuple[Array, Array, Array]] = []
         along = curve.places
         for piece in self.pieces:
-            # Points of the curve between both ends of the piece, which are exact at limits.
+            # Take the points of the curve inside the piece, and its ends, which are exact at limits.
             inner = np.flatnonzero((along > piece.begin + 1e-12) & (along < piece.end - 1e-12))
             (first, t_first), (last, t_last) = (curve.point(place) for place in (piece.begin, piece.end))
             shift = _TURN * np.array(piece.turns)
@@ -216,7 +216,7 @@ class SelfMotions(Shown):
     maps: ArmMaps
     target: Array  #: the task value as the kernel takes it
     components: tuple[Arc, ...]  #: the longest first
-    curves: int  #: number of curves without limits, of which the components are parts
+    curves: int  #: number of curves without limits that the components are parts of
 
     @cached_property
     def x(self) -> Array:
@@ -239,7 +239,7 @@ class SelfMotions(Shown):
 
         Args:
             n: their number.
-            metric: as in `Arc.sample`, where each component by itself has equal distances.
+            metric: as in `Arc.sample`; distances are equal on each component by itself.
         """
         require_count("n", n, least=2, most=RULES.most)
         counts = [max(2, round(n * arc.length / self.length)) for arc in self.components]
@@ -247,7 +247,7 @@ class SelfMotions(Shown):
         return np.vstack([np.empty((0, self.maps.robot.n)), *parts])
 
     def nearest(self, q: ArrayLike) -> Place:
-        """The posture nearest to q (n,), by |q - q_wish| with full turns of joints without limits left out.
+        """The posture nearest to q (n,), by |q - q_wish| without full turns of joints without limits.
 
         Raises:
             InvalidValueError: if there are no components.
@@ -255,7 +255,7 @@ class SelfMotions(Shown):
         wish = as_point("q", q, self.maps.robot.n)
         self._require_components()
         arcs = self.components
-        # Distances of points on all arcs, some on each of their steps.
+        # Compute distances of points on all arcs, `RULES.parts` on each step.
         shares = np.arange(RULES.parts) / RULES.parts
         nodes = [arc._nodes for arc in arcs]
         places = [np.concatenate([(at[:-1] + np.diff(at) * u) for u in shares] + [at[-1:]]) for _, _, at in nodes]
@@ -263,7 +263,7 @@ class SelfMotions(Shown):
         guesses = np.vstack([arc._guess(part)[0] for arc, part in zip(arcs, places, strict=True)])
         distances = (self.measure_away(guesses, wish) ** 2).sum(axis=1)
         along = np.concatenate(places)
-        # The squared distance may have several minima: some of the nearest points, apart from one another, are refined.
+        # The squared distance may have several minima, so a few of the nearest points, far apart, are refined.
         order, chosen = np.argsort(distances), list[int]()
         for row in order[: RULES.parts * RULES.candidates].tolist():
             apart = [owners[row] != owners[other] or abs(along[row] - along[other]) > RULES.largest for other in chosen]
@@ -282,7 +282,7 @@ class SelfMotions(Shown):
             f: joint positions (N, n) -> values (N,), or "manipulability", `Task.manipulability` of the task.
 
         Raises:
-            InvalidValueError: if there are no components, or f returns something else, or a number nowhere.
+            InvalidValueError: if there are no components, or f returns a wrong shape, or no number at any posture.
         """
         self._require_components()
 
@@ -296,7 +296,7 @@ class SelfMotions(Shown):
                 raise InvalidValueError("what f returns", f"shape {values.shape}", f"({len(q)},)")
             return np.where(np.isnan(values), -np.inf, values)
 
-        # First at even places on all arcs.
+        # Evaluate f at even places on all arcs.
         counts = [max(2, int(arc.length / RULES.spacing) + 2) for arc in self.components]
         places = [np.linspace(0.0, arc.length, count) for arc, count in zip(self.components, counts, strict=True)]
         q = np.vstack([arc.at(part) for arc, part in zip(self.components, places, strict=True)])
@@ -306,7 +306,7 @@ class SelfMotions(Shown):
         row, owners = int(np.argmax(values)), np.repeat(np.arange(len(counts)), counts)
         k = int(owners[row])
         arc, at, step = self.components[k], float(np.concatenate(places)[row]), self.components[k].length / counts[k]
-        # Then by golden section around the best of them, on its arc.
+        # Refine the best place by golden-section search on its arc.
         low, high = max(0.0, at - 2 * step), min(arc.length, at + 2 * step)
         best = Place(q[row], float(values[row]), k, at)
         ratio = (np.sqrt(5) - 1) / 2
@@ -326,8 +326,8 @@ class SelfMotions(Shown):
         """The least distance in joint space between two components.
 
         Args:
-            a: number of a component.
-            b: number of another one.
+            a: index of a component.
+            b: index of another component.
 
         Raises:
             InvalidValueError: if there are no such components, or they are the same.
@@ -343,7 +343,7 @@ class SelfMotions(Shown):
         rows = [arc.at(places) for arc, places in zip((first, second), spaced, strict=True)]
         apart = [np.linalg.norm(self.measure_away(rows[1], q), axis=1) for q in rows[0]]
         i, j = np.unravel_index(int(np.argmin(apart)), (len(rows[0]), len(rows[1])))
-        # From the nearest pair of points, the nearest posture on one arc and on the other one in turn.
+        # Start from the nearest pair of points, and project onto the two arcs in turn.
         near, at = rows[0][i], (float(spaced[0][i]), float(spaced[1][j]))
         best, value = None, np.inf
         for _ in range(MERGE.pairs):
@@ -359,9 +359,9 @@ class SelfMotions(Shown):
     def merge(self, a: int, b: int) -> Merge:
         """A way from one component to another on which x deviates little.
 
-        From the straight way across their gap, postures go down to smaller errors of x, across the way, which is kept
-        at equal distances. It is one way, not the best of all: the least error of any way is that of this one, or less.
-        Straight ways between neighbouring postures count, at 16 places of each.
+        The search starts from the straight way across their gap. Its postures move across the way to smaller errors of
+        x, and stay at equal distances. The way is a local solution: another one may have a smaller largest error.
+        Errors are also measured on the straight line between neighbouring postures, at 16 places.
 
         Args:
             a: number of a component.
@@ -374,7 +374,7 @@ class SelfMotions(Shown):
             The string method: E, Ren and Vanden-Eijnden, J. Chem. Phys. 126 (2007) 164103, with Gauss-Newton steps.
         """
         gap = self.gap(a, b)
-        # The straight way across the gap, in even images.
+        # Start with postures at equal distances on the straight way across the gap.
         end = gap.first.q + self.measure_away(gap.second.q[None], gap.first.q)[0]
         q, before = np.linspace(gap.first.q, end, MERGE.images), np.inf
         low, high = self.maps.robot.lower, self.maps.robot.upper
@@ -384,7 +384,7 @@ class SelfMotions(Shown):
             if abs(before - most) < MERGE.settled * most:
                 break
             before = most
-            # Each image goes towards x, but not along the way.
+            # Move each posture towards x, but not along the way.
             gram = J @ J.transpose(0, 2, 1)
             floor = MERGE.damping * np.trace(gram, axis1=1, axis2=2)[:, None, None] * np.eye(e.shape[1])
             step = (J.transpose(0, 2, 1) @ np.linalg.solve(gram + floor, e[:, :, None]))[:, :, 0]
@@ -395,15 +395,15 @@ class SelfMotions(Shown):
                 MERGE.step, MERGE.longest / np.maximum(np.linalg.norm(step, axis=1, keepdims=True), 1e-300)
             )
             q[1:-1] = np.clip(q + step, low, high)[1:-1]
-            # Images stay at equal distances, and become more as the way gets longer.
+            # Space the postures evenly again, and add some as the way gets longer.
             lengths = np.concatenate([[0.0], np.cumsum(np.linalg.norm(np.diff(q, axis=0), axis=1))])
             even = np.linspace(0.0, lengths[-1], max(MERGE.images, int(lengths[-1] / MERGE.spacing) + 2))
             q = np.column_stack([np.interp(even, lengths, column) for column in q.T])
-        # The largest error is that of a pass between both sides, which Newton's method finds exactly.
+        # The largest error is at a saddle between both sides, which Newton's method finds exactly.
         errors = self._measure_errors(q)
         k = int(np.argmax(errors))
         q[k] = self._find_pass(q[k], float(errors[k]))
-        # The way from image to image counts, too.
+        # Measure errors between neighbouring postures, too.
         shares = np.arange(MERGE.parts)[:, None, None] / MERGE.parts
         whole = np.vstack([(q[:-1] + shares * np.diff(q, axis=0)).reshape(-1, q.shape[1]), q[-1:]])
         errors = self._measure_errors(whole)
@@ -416,7 +416,7 @@ class SelfMotions(Shown):
         return np.asarray(np.linalg.norm(self.maps.evaluate(q, np.tile(self.target, (len(q), 1)))[0], axis=1))
 
     def _find_pass(self, q: Array, error: float) -> Array:
-        """The posture near q (n,) within the limits at which |e|^2 neither rises nor falls; q where there is none."""
+        """The posture near q (n,) within the limits at which |e|^2 is stationary; q if there is none."""
         at, target = q.copy(), self.target[None]
         bend = build_curvature(self.maps.equations)
         for _ in range(MERGE.pairs):
@@ -426,18 +426,18 @@ class SelfMotions(Shown):
             at = at + min(1.0, RULES.largest / (size + 1e-300)) * step
             if size < MERGE.settled:
                 break
-        # Only a pass near the images is theirs.
+        # Accept only a pass near the given posture.
         inside = ((at >= self.maps.robot.lower) & (at <= self.maps.robot.upper)).all()
         found = float(np.linalg.norm(self.maps.evaluate(at[None], target)[0]))
         good = inside and size < MERGE.settled and abs(found - error) < MERGE.near * error
         return at if good and np.linalg.norm(at - q) < MERGE.away else q
 
     def plot(self) -> Figure:
-        """A picture: the joints along each component, in shares of their ranges, with the joints that stop it named."""
+        """Plot the joints along each component, relative to their ranges; titles name the joints that stop it."""
         from matplotlib.figure import Figure  # heavy, and few calls need it
 
         robot, figure = self.maps.robot, Figure(figsize=(8.0, 2.2 * max(1, len(self))), layout="constrained")
-        # A row of axes for each arc, with the outer tenth of the joints' ranges in grey.
+        # Draw one row of axes for each arc, with the outer tenth of the joints' ranges in grey.
         for k, arc in enumerate(self.components):
             axes = figure.add_subplot(len(self), 1, k + 1)
             places = np.linspace(0.0, arc.length, max(2, int(arc.length / RULES.spacing)))
@@ -458,7 +458,7 @@ class SelfMotions(Shown):
         return figure
 
     def facts(self) -> dict[str, str]:
-        """How many components there are, how long, and what stops them."""
+        """Number and length of the components, and what stops them."""
         closed = sum(arc.closed for arc in self.components)
         stops: dict[str, int] = {}
         for arc in self.components:
@@ -481,21 +481,21 @@ class SelfMotions(Shown):
         return np.asarray(wrap_shortest(q - wish, np.where(free, _TURN, 0.0)))
 
     def _refine(self, k: int, place: float, wish: Array) -> Place:
-        """The nearest posture on an arc next to a place of it: secants for (q - wish) . t = 0 along the arc."""
+        """The nearest posture on an arc near a place, by secant steps for (q - wish) . t = 0 along the arc."""
         arc = self.components[k]
         best, pull, slope, trial, step = Place(wish, np.inf, k, place), 0.0, 1.0, place, 0.0
         for _ in range(RULES.refinements):
             q, t = (part[0] for part in arc._stand(np.array([trial])))
             away = self.measure_away(q[None], wish)[0]
             gap, turned = float(np.linalg.norm(away)), float(away @ t)
-            # Where the way to the posture is at right angles to the arc, the distance is least.
+            # The distance is least where q - wish is perpendicular to the arc.
             if step:
                 slope = max(
                     RULES.least_slope, (turned - pull) / step, 0.0 if gap < best.value else 2 * abs(pull / step)
                 )
             if gap < best.value:
                 best, pull = Place(wish + away, gap, k, trial), turned
-            # From the best place so far: one that is farther away makes the next step half as long, or less.
+            # Step from the best place so far; after a worse place, the next step is at most half as long.
             new = best.place - float(np.clip(pull / slope, -RULES.largest, RULES.largest))
             trial = new % arc.length if arc.closed else min(max(new, 0.0), arc.length)
             step = (new if arc.closed else trial) - best.place
@@ -505,7 +505,7 @@ class SelfMotions(Shown):
 
 
 def find_motions(maps: ArmMaps, target: Array, *starts: Array) -> SelfMotions:
-    """All self-motions of a target (k,), from starts (S, n) of one's own and from stored postures."""
+    """All self-motions of a target (k,), from given starts (S, n) and from stored postures."""
     curves = maps.find_curves(target, *starts)
     arcs = [arc for curve in curves for arc in cut_curve(maps, target, curve)]
     arcs.sort(key=lambda arc: -arc.length)
@@ -514,7 +514,7 @@ def find_motions(maps: ArmMaps, target: Array, *starts: Array) -> SelfMotions:
 
 def cut_curve(maps: ArmMaps, target: Array, curve: Curve) -> list[Arc]:
     """The arcs of a curve within the limits: for each number of full turns of the joints, where all are inside."""
-    # Full turns after which each joint is within its limits at the begin.
+    # Find the full turns that put each joint within its limits at the begin.
     present: list[set[int]] = []
     for q, (low, high, turns) in zip(curve.q[0].tolist(), maps.limits, strict=True):
         if turns and math.isfinite(low):
@@ -522,7 +522,7 @@ def cut_curve(maps: ArmMaps, target: Array, curve: Curve) -> list[Arc]:
             present.append(set(range(lowest, highest + 1)))
         else:
             present.append({0} if low <= q <= high else set())
-    # What ends pieces that no limit ends: the seam of a closed curve is joined later.
+    # Pieces that no limit ends stop at the seam of a closed curve, which is joined later, or at the end of the curve.
     opened = Stop(StopKind.SINGULAR)
     seam = Stop(StopKind.ENDLESS) if curve.closed else opened
     active: dict[tuple[int, ...], tuple[float, Stop]] = dict.fromkeys(product(*present), (0.0, seam))
@@ -530,7 +530,7 @@ def cut_curve(maps: ArmMaps, target: Array, curve: Curve) -> list[Arc]:
     found, stops = curve.crossings, maps.stops
     columns = (found[name].tolist() for name in ("place", "joint", "side", "turns", "rises"))
     for place, i, side, turns, rises in zip(*columns, strict=True):
-        # A joint less k turns comes within its limits, or leaves them: pieces begin or end, for all turns of others.
+        # A joint after k turns enters or leaves its limits, so pieces begin or end for all turns of the other joints.
         k, enters, stop = -turns, side != rises, stops[i][side]
         if enters and k not in present[i]:
             present[i].add(k)
@@ -551,10 +551,10 @@ def cut_curve(maps: ArmMaps, target: Array, curve: Curve) -> list[Arc]:
 def _join_at_seam(
     maps: ArmMaps, target: Array, curve: Curve, pieces: list[tuple[Piece, Stop, Stop]], seam: Stop
 ) -> list[Arc]:
-    """Arcs of pieces of a closed curve that go on beyond its last point."""
+    """Join pieces of a closed curve across its last point to arcs."""
     winding = np.where(np.isfinite(maps.robot.lower), np.rint((curve.q[-1] - curve.q[0]) / _TURN), 0.0)
     winding = np.where(maps.turning, winding, 0.0).astype(int)
-    # The piece that goes on after the last point has the full turns that the curve winds by added.
+    # The next piece after the last point has the turns of this one plus the winding of the curve.
     begins = {piece.turns: k for k, (piece, began, _) in enumerate(pieces) if began is seam}
     follower: dict[int, int] = {}
     for k, (piece, _, ended) in enumerate(pieces):
@@ -562,7 +562,7 @@ def _join_at_seam(
             after = tuple((np.array(piece.turns) + winding).tolist())
             if after in begins:
                 follower[k] = begins[after]
-    # Chains of pieces: those that begin at a limit first, then closed ones.
+    # Chain the pieces: first chains that begin at a limit, then closed chains.
     arcs, used = [], set[int]()
     heads = [k for k in range(len(pieces)) if k not in follower.values()]
     for head in [*heads, *range(len(pieces))]:

@@ -1,4 +1,4 @@
-"""A tracker of task values and coordinates that is never lost: exact in charts, and x first everywhere else."""
+"""A tracker of task values and coordinates that is never lost: exact in charts; elsewhere x has priority."""
 
 from __future__ import annotations
 
@@ -21,11 +21,11 @@ class TrackStatus(IntEnum):
     """How the last call of an arm's tracker ended."""
 
     OK = 0  #: x is met, and xi if one was given
-    YIELDING = 1  #: x is met; xi is another one: a limit, a border of the chart or the speed of joints is in its way
+    YIELDING = 1  #: x is met, xi is not: a joint limit, a border of the chart or the joint speed prevents it
     BEHIND = 2  #: x is not met: the arm moves towards it as fast as its joints may, or goes another way to it
     NEAREST = 3  #: x is out of reach from here: a local minimum of its error within the limits, at rest
     BAD_INPUT = 4  #: a number of x or xi is not finite, or x no orientation (beyond half a turn); the arm stays
-    BRAKED = 5  #: a part of the way, or none: all of it would come nearer to a contact than `margin` allows
+    BRAKED = 5  #: the arm took part of the step, or none: the whole step would come nearer to a contact than `margin`
 
 
 class ArmTracker(Shown):
@@ -75,7 +75,7 @@ class ArmTracker(Shown):
         clearance: Clearance | None = None,
     ) -> None:
         robot, m, span = kernel.maps.robot, kernel.maps.task.m, as_number("period", period)
-        # Limits are steps of one call in C.
+        # C takes the limits as steps of one call.
         if not 1e-5 <= span <= 10:
             raise InvalidValueError("period", period, "a time from 1e-5 to 10 s")
         require_kind("detours", detours, bool)
@@ -84,7 +84,7 @@ class ArmTracker(Shown):
         change = _read_limits("acceleration_limits", acceleration_limits, np.full(robot.n, np.inf))
         weight = _read_limits("weights", weights, np.ones(robot.n))
         self._kernel, self._clearance, self._r = kernel, clearance, robot.n - m
-        # What the tracker knows between calls is one record of C: `NAME_tracker` of templates/arm_track.h.jinja.
+        # The state between calls is one record of C: `NAME_tracker` of templates/arm_track.h.jinja.
         self._state = np.zeros(1, tracker_type(robot.n, self._r, kernel.target_size))
         self._state["most"], self._state["change"] = speed * span, change * span**2
         self._state["weight"] = weight / weight.max()
@@ -93,7 +93,7 @@ class ArmTracker(Shown):
         self.reset(q)
 
     def _connect(self) -> None:
-        """Places of the state and of what a call is given, for C."""
+        """Pointers for C to the state and to the arguments of a call."""
         self._x, self._target = np.empty(self._kernel.maps.task.m), np.empty(self._kernel.target_size)
         self._wish: Array = np.empty(self._r)
         places = (pointer(part) for part in (self._state, self._x, self._target, self._wish))
@@ -102,7 +102,7 @@ class ArmTracker(Shown):
         self._q: Array = self._state["q"][0]
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without scratch memory."""
+        """State without scratch memory."""
         return {"kernel": self._kernel, "memory": self._state.tobytes(), "clearance": self._clearance, "r": self._r}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -126,7 +126,7 @@ class ArmTracker(Shown):
     @property
     def xi(self) -> Any:
         """xi of the last posture, a number, or (r,) of several; NaN outside the domain of the tracker's chart."""
-        # Beyond its chart, the arm has no xi.
+        # Outside the domain of its chart, the arm has no xi.
         if not self._state["inside"][0]:
             return float("nan") if self._r == 1 else np.full(self._r, np.nan)
         value = np.asarray(self._kernel.charts[int(self._state["chart"][0])].xi(self.q))
@@ -141,7 +141,7 @@ class ArmTracker(Shown):
         return str(chart.notes.get("branch", chart.problem.name))
 
     def facts(self) -> dict[str, str]:
-        """Where it is."""
+        """Status, posture and branch."""
         return {
             "tracker": f"status {self.status.name}",
             "q": number_list(self.q),
@@ -152,7 +152,7 @@ class ArmTracker(Shown):
         """Continue from another posture (n,) within the joint limits, at rest.
 
         Raises:
-            InvalidValueError: if it is not within them, or a pair touches there.
+            InvalidValueError: if q is outside the limits, or a pair touches there.
         """
         robot = self._kernel.maps.robot
         point = as_point("q", q, robot.n)
@@ -187,7 +187,7 @@ class ArmTracker(Shown):
                 self._state["near"] = near
             else:
                 self._wish[:], wished = np.nan, True  # BAD_INPUT
-        # A plain vector is read in C, which is most of the time of a call.
+        # Read a plain vector in C, because reading takes most of the time of a call.
         if type(x) is np.ndarray and x.dtype == np.float64 and x.shape == (maps.task.m,):
             self._x[:] = x
             return self._move(self._kernel.library.track_value, self._x_at, wished)
@@ -198,7 +198,7 @@ class ArmTracker(Shown):
         return self._move(self._kernel.library.arm_track, self._target_at, wished)
 
     def step_to(self, target: Array, xi: ArrayLike | None) -> Array:
-        """As `step`, for x as `orthocas.arms.kernel.build_equations` takes it."""
+        """As `step`, for a target as `orthocas.arms.kernel.build_equations` takes it."""
         if xi is not None:
             self._read_wish(xi)
         self._target[:] = target
@@ -215,7 +215,7 @@ class ArmTracker(Shown):
         self._wish[:] = values
 
     def _move(self, track: Any, at: Any, wished: bool) -> Array:
-        """One call of C, and what contacts ask of it."""
+        """One call of C, repeated to avoid contacts and shortened by the margin."""
         wish = self._wish_at if wished else None
         if self._clearance is None:
             track(self._at, self._postures_at, at, wish)
@@ -227,16 +227,16 @@ class ArmTracker(Shown):
                 break
             track(self._at, self._postures_at, at, wish)
         self._state["pushes"] = 0
-        # What still comes nearer than the margin goes a part of the way.
+        # Take only part of a step that still comes nearer than the margin.
         q, fraction = self._clearance.limit(before, self.q)
         if fraction < 1:
             self._kernel.library.arm_track_hold(self._at, pointer(np.ascontiguousarray(q)), int(TrackStatus.BRAKED))
         return self.q
 
     def _push(self, clearance: Clearance, memory: NDArray[np.void]) -> bool:
-        """Go back to where the call began, with a row for each pair that it brought nearer than `avoid`, if any.
+        """Undo the call, and add a row for each pair that it brought nearer than `avoid`; False if there is none.
 
-        grad d . (q + step - q_1) + d_1 = avoid, with the distance d_1 where the call ended, at q_1.
+        grad d . (q + step - q_1) + d_1 = avoid, with the distance d_1 at q_1, where the call ended.
         """
         assert clearance.avoid is not None
         end = self.q
@@ -252,7 +252,7 @@ class ArmTracker(Shown):
             for distance, slope in zip(near.distance.tolist(), near.gradient, strict=True)
         ]
         fresh = len(rows)
-        # Pairs of an earlier turn stay, unless a row of this one has nearly their direction.
+        # Keep rows of earlier turns, unless a new row has nearly the same direction.
         for slope, room in known:
             least = RULES.aligned * float(np.linalg.norm(slope))
             if not any(float(slope @ other) > least * float(np.linalg.norm(other)) for other, _ in rows[:fresh]):
