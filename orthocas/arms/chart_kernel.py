@@ -25,43 +25,43 @@ from orthocas.tools.checks import Array, Indices
 from orthocas.tools.expressions import wrap_shortest
 
 _FLAGS = ("-O3",)
-_PROBES = 32  # postures at which full turns are tried
+_PROBES = 32  # number of postures at which full turns are tried
 
 
 @dataclass(frozen=True, slots=True)
 class ChartKernelRules:
-    """Numbers of the search for postures with x and xi, and of the tracker.
+    """Settings of the search for postures with x and xi, and of the tracker.
 
     Errors of x are in radians, or as long as a radian moves the tip; joint positions in [rad] or [m].
     """
 
-    met: float = 1e-10  #: error of x that is met
-    xi_met: float = 1e-10  #: error of xi that is met
+    met: float = 1e-10  #: error of x below which x is met
+    xi_met: float = 1e-10  #: error of xi below which xi is met
     squared: float = 3e-6  #: errors of x and xi that one more step of Newton's method reduces to their squares
     xi_found: float = 1e-9  #: error of xi of a posture that has it
-    xi_weight: float = 1e-3  #: of errors of xi, relative to those of x
-    posture_weight: float = 1e-4  #: of the way back to the last posture with a chart, where there is none
-    push_weight: float = 1.0  #: of pairs that come nearer than `avoid`, relative to x
-    pushes: int = 8  #: of these pairs, the nearest ones
-    turns: int = 4  #: of a call, until no more pairs come nearer
-    kept: float = 1e-5  #: [m] that these may be nearer than `avoid`
+    xi_weight: float = 1e-3  #: weight of errors of xi, relative to errors of x
+    posture_weight: float = 1e-4  #: weight of the return to the last posture with a chart, outside charts
+    push_weight: float = 1.0  #: weight of pairs that come nearer than `avoid`, relative to x
+    pushes: int = 8  #: largest number of these pairs; the nearest are taken
+    turns: int = 4  #: largest number of repetitions of a call, until no more pairs come nearer
+    kept: float = 1e-5  #: distance by which pairs may be nearer than `avoid` [m]
     aligned: float = 0.9  #: cosine between the rows of two pairs, or of one at two postures, above which one counts
-    way_weight: float = 1e-2  #: of the way to a posture with x and xi that was found
-    step_damping: float = 1e-8  #: of squared joint steps
-    error_damping: float = 0.3  #: of squared joint steps, times the squared error of x
-    damping: float = 1e-3  #: of squared joint steps after one that does not lower the error, at least
-    grows: float = 10.0  #: damping after another one; it shrinks as much after one that does
-    rounds: int = 12  #: of a descent, at most
-    far_rounds: int = 4  #: of them, those with an error above `near`
-    gain: float = 1e-9  #: relative decrease of the squared error below which it is a minimum
-    near: float = 3e-4  #: error of x below which the last posture with a chart does not count
-    decrease: float = 1e-4  #: of the cost, relative to what a step promises
+    way_weight: float = 1e-2  #: weight of the way to a posture with x and xi that was found
+    step_damping: float = 1e-8  #: damping of squared joint steps
+    error_damping: float = 0.3  #: damping of squared joint steps, times the squared error of x
+    damping: float = 1e-3  #: least damping of squared joint steps after a step that does not lower the error
+    grows: float = 10.0  #: factor of damping after each further such step; damping shrinks as much after a good step
+    rounds: int = 12  #: largest number of rounds of a descent
+    far_rounds: int = 4  #: largest number of these rounds with an error above `near`
+    gain: float = 1e-9  #: relative decrease of the squared error below which a minimum is reached
+    near: float = 3e-4  #: error of x below which the last posture with a chart is ignored
+    decrease: float = 1e-4  #: least decrease of the cost, relative to the predicted decrease
     enough: float = 1e-2  #: relative decrease of the cost below which a far arm leaves the rest to the next call
     falls: float = 0.9  #: of an error at the end of a window, relative to that at its begin, where the arm is not stuck
     guesses: int = 8  #: of the joints at bounds in a quadratic program, many at a time
     changes: int = 40  #: of these joints, one at a time, at most
-    rounding: float = 1e-14  #: slope of the cost at a bound that is none
-    sweeps: int = 8  #: of Jacobi's method for eigenvalues, at most
+    rounding: float = 1e-14  #: slope of the cost at a bound below which it counts as zero
+    sweeps: int = 8  #: largest number of sweeps of Jacobi's method for eigenvalues
     flattest: float = 2.0  #: least curvature that counts, in errors: less would amplify the tremor of a hand
     calms: float = 0.8  #: factor of it for each call since the target moved
     saddle: float = 0.02  #: slope of the error, relative to its curvature, below which a posture is next to a saddle
@@ -70,27 +70,27 @@ class ChartKernelRules:
     even: float = 1e-7  #: slope of a saddle, relative to its curvature, below which both sides are alike
     astride: float = 0.05  #: step to a side of a saddle
     largest: float = 0.7  #: norm of a step of Newton's method
-    in_chart: int = 10  #: rounds of it at a tick in the chart
-    seek_rounds: int = 24  #: of it, from a stored posture
-    solve_rounds: int = 8  #: of it, from one of many near ones
-    searched: int = 24  #: stored postures that a tracker tries, one a tick
-    longest: int = 16  #: windows that it waits after a search that found nothing, at most
+    in_chart: int = 10  #: rounds of Newton's method in one call in the chart
+    seek_rounds: int = 24  #: rounds of Newton's method from a stored posture
+    solve_rounds: int = 8  #: rounds of Newton's method from one of many near postures
+    searched: int = 24  #: number of stored postures that a tracker tries, one a call
+    longest: int = 16  #: largest number of windows that a tracker waits after a search that found nothing
     near_starts: int = 6  #: stored postures of a chart that a row tries before all curves of x are searched
-    spacing: float = 0.05  #: between points of curves at which xi is looked at
+    spacing: float = 0.05  #: distance between points of curves at which xi is evaluated
     room: float = 0.05  #: beyond limits, within which a point between nodes may be inside
-    same: float = 1e-6  #: [rad] or [m] between postures that are the same
-    every: int = 1000  #: postures with x and xi, at most
-    lifts: int = 4096  #: combinations of full turns of joints, at most
-    singular_bend: float = 2.0  #: of the least singular value along a curve, its second derivative [1/rad^2]
-    inverse_rounds: int = 3  #: of inverse iteration for it
-    bisections: int = 30  #: between two of these points, at most
-    halved: int = 3  #: of them, before Newton's method is tried
-    curve_starts: int = CURVES.starts  #: of the search of all curves
-    patience: int = 32  #: of them in turn that find no new curve, after which the search ends
-    postures: int = 2000  #: stored in the domain of each chart, and in all of the joint range
-    seed: int = 0  #: of them
-    speed: float = 2.0  #: [rad/s] or [m/s] of joints whose file gives no velocity limit
-    window: float = 0.25  #: [s] without progress after which a tracker looks for another way
+    same: float = 1e-6  #: distance below which postures are the same [rad] or [m]
+    every: int = 1000  #: largest number of postures with x and xi
+    lifts: int = 4096  #: largest number of combinations of full turns of joints
+    singular_bend: float = 2.0  #: second derivative of the least singular value along a curve [1/rad^2]
+    inverse_rounds: int = 3  #: rounds of inverse iteration for the least singular value
+    bisections: int = 30  #: largest number of bisections between two points of a curve
+    halved: int = 3  #: number of bisections before Newton's method is tried
+    curve_starts: int = CURVES.starts  #: number of starts of the search for all curves
+    patience: int = 32  #: number of starts in turn without a new curve after which the search ends
+    postures: int = 2000  #: number of postures stored in each chart's domain, and in the whole joint range
+    seed: int = 0  #: random seed of these postures
+    speed: float = 2.0  #: velocity limit of joints whose file gives none [rad/s] or [m/s]
+    window: float = 0.25  #: time without progress after which a tracker looks for another way [s]
     piece: int = 32  #: rows that a thread takes at once
 
 
@@ -129,19 +129,19 @@ def tracker_type(n: int, r: int, target: int) -> np.dtype[Any]:
 
 @dataclass(frozen=True, eq=False)
 class ChartPostures:
-    """Postures of the domains of charts, one chart after the other, then of all of the joint range."""
+    """Postures in the domains of charts, one chart after the other, then in the whole joint range."""
 
     q: Array  #: (S, n)
-    places: NDArray[np.float32]  #: (S, k), as of `StoredPostures`, by rows
-    xi: NDArray[np.float32]  #: of the own chart, (S, r)
-    begins: NDArray[np.intc]  #: (charts + 1,)
+    places: NDArray[np.float32]  #: (S, k), as in `StoredPostures`, but in rows
+    xi: NDArray[np.float32]  #: coordinates in the chart of each posture, (S, r); 0 for postures of the joint range
+    begins: NDArray[np.intc]  #: index of the first posture of each chart, then of the joint range, (charts + 1,)
 
     @classmethod
     def build(cls, maps: ArmMaps, charts: Sequence[Chart], count: int) -> "ChartPostures":
-        """So many for each chart."""
+        """Sample `count` postures for each chart, and for the whole joint range."""
         robot, r = maps.robot, maps.robot.n - maps.task.m
         whole = find_joint_range(robot, 0)
-        # Those of charts give starts with x and xi; those of all of the range, starts with x alone.
+        # Postures of charts are starts with x and xi; postures of the whole range are starts with x alone.
         own = [np.asarray(chart.problem.domain.sample(count, RULES.seed)) for chart in charts]
         rng = np.random.default_rng(RULES.seed)
         free = rng.uniform(whole.centre - whole.half_width, whole.centre + whole.half_width, (count, robot.n))
@@ -157,7 +157,7 @@ class ChartPostures:
 
     @cached_property
     def in_c(self) -> PosturesInC:
-        """For C, as long as this object lives."""
+        """The record for C, valid as long as this object lives."""
         return PosturesInC(len(self.q), *(pointer(part) for part in (self.q, self.places, self.xi, self.begins)))
 
 
@@ -180,11 +180,11 @@ class ChartKernel:
     def solve_rows(
         self, targets: Array, xi: Array, starts: Array | None, allowed: Sequence[int]
     ) -> tuple[Array, Indices, Indices]:
-        """Postures (N, n) of targets (N, k) and xi (N,), numbers of `InverseStatus`, and of charts; -1 for none."""
+        """Postures (N, n) of targets (N, k) and xi (N,), `InverseStatus` numbers, and chart indices; -1 for none."""
         count, n = len(targets), self.maps.robot.n
         q = np.empty((count, n))
         status, owner = (np.empty(count, dtype=np.intc) for _ in range(2))
-        # Which charts may answer.
+        # Mark the charts that may answer.
         flags = np.isin(np.arange(len(self.charts)), allowed).astype(np.int8)
         solve, stored, whole = self.library.solve_rows, self.postures.in_c, self._range
         inputs = [np.ascontiguousarray(part) for part in (targets, xi)]
@@ -199,7 +199,7 @@ class ChartKernel:
                 *(pointer(part[rows]) for part in (q, status, owner)),
             )
 
-        # A call of few rows costs no threads.
+        # Solve a few rows without threads.
         if count <= RULES.piece:
             solve_piece(0)
         else:
@@ -228,14 +228,14 @@ class ChartKernel:
         return np.empty(CURVES.nodes * (2 * self.maps.robot.n + 1) + (len(self.maps.stored.q) + 1) // 2)
 
     def build_targets(self, vectors: Array) -> Array:
-        """As `TargetReader.build`, of contiguous vectors (N, m)."""
+        """As `TargetReader.build`, for contiguous vectors (N, m)."""
         targets = np.empty((len(vectors), self.target_size))
         self.library.build_targets(len(vectors), pointer(vectors), pointer(targets))
         return targets
 
     @cached_property
     def postures(self) -> ChartPostures:
-        """From which searches start."""
+        """Postures from which searches start."""
         return ChartPostures.build(self.maps, self.charts, RULES.postures)
 
     @cached_property
@@ -262,7 +262,7 @@ class ChartKernel:
 
     @cached_property
     def target_size(self) -> int:
-        """Numbers of a target."""
+        """Length of a target vector."""
         return int(self.maps.equations.size1_in(1))
 
 
@@ -272,12 +272,12 @@ def write_tracker(
     """Sources of an arm's tracker, by the names of their files: NAME_track.h and .c.
 
     Args:
-        maps: of the arm.
-        charts: of the arm; they may be none.
+        maps: maps of the arm.
+        charts: charts of the arm, possibly none.
         name: prefix of names in C.
         template: "arm_track.c", or "arm_rows.c" for the searches of many rows as well.
         header: first lines of both files.
-        postures: stored for each chart, in the code; 0 for none there.
+        postures: number of postures per chart that the code stores; 0 for none.
     """
     robot, task, n = maps.robot, maps.task, maps.robot.n
     equations, rows = maps.equations, template != "arm_track.c"
@@ -301,7 +301,7 @@ def write_tracker(
         parts.append({"bound": 0.0, "alike": np.zeros(n, dtype=bool), **part})
     kernels = generate_kernels(functions, f"{name}_kernel")
     size = equations.size1_in(1)
-    # How the header describes a target.
+    # Describe a target for the header.
     words = f"its vector ({size})"
     if maps.turned:
         words = "the rotation (3, 3) of the frame by columns"
@@ -344,7 +344,7 @@ def write_tracker(
         around = [home + np.where(winds, sign * 3 * np.pi, sign * np.inf) for sign in (-1, 1)]
         lift_low = np.where(endless, np.maximum(lows.min(axis=0), around[0]), robot.lower)
         lift_high = np.where(endless, np.minimum(highs.max(axis=0), around[1]), robot.upper)
-        # All combinations of full turns find room, so that none is dropped.
+        # Reserve memory for all combinations of full turns, so that none is dropped.
         ranges = np.where(maps.turning, lift_high - lift_low + 2 * RULES.room + CURVES.step, 0.0)
         lifts = np.prod(np.floor(ranges[np.isfinite(ranges)] / (2 * np.pi)) + 1)
         if lifts > RULES.lifts:

@@ -1,4 +1,4 @@
-"""Joint velocities from phi = [x; xi]: a law ([AS2023] Sec. 9), and a task for quadratic programs of others."""
+"""Joint velocities from phi = [x; xi]: a law ([AS2023] Sec. 9), and a task for quadratic programs of pink and mink."""
 
 from __future__ import annotations
 
@@ -36,12 +36,12 @@ from orthocas.tools.expressions import wrap_shortest
 class Kinematic(LawOfChart):
     """Joint velocity dq = J^-1 (d_phi_d + Lambda (phi_d - phi)).
 
-    The error e = phi - phi_d obeys de/dt = -Lambda e, so every start ends on the reference.
+    The error e = phi - phi_d obeys de/dt = -Lambda e, so the error decays from every start.
 
     Args:
         chart: a chart with a closed expression (not a grown one).
-        feedback: diagonal of Lambda, >= 0, (n,) or one number [1/s]; default 10. The paper uses 0, which keeps every
-            error: of the start, of the integration, and of jumps of the reference or the sensors.
+        feedback: diagonal of Lambda, >= 0, (n,) or one number [1/s]; default 10. The paper uses 0, which keeps errors
+            of the start and of the integration, and those from jumps of the reference or the sensors.
         limit: largest speed of each joint, (n,) or one number [rad/s] or [m/s]; default those of the robot.
 
     Raises:
@@ -92,7 +92,7 @@ class Kinematic(LawOfChart):
         inputs = named_inputs(n, self.gains, n)
         q = inputs["q"]
 
-        # The rate d_phi_d - Lambda_feedback e that phi is to have.
+        # Compute the desired rate of phi, d_phi_d - Lambda_feedback e.
         e, J = compute_errors(self.chart, q, inputs["reference"])
         rate = compute_drift(self.chart, q, inputs["reference"], inputs["reference_velocity"]) - inputs["feedback"] * e
 
@@ -111,16 +111,16 @@ class Kinematic(LawOfChart):
 class XiTask(Shown):
     """e = xi(q) - xi_d for differential inverse kinematics with pink or mink: J_xi dq = -gain e, at a cost.
 
-    It stands in their lists of tasks, or of constraints, in place of a posture task. The tool's own task does not
-    disturb xi, so both are met together; a posture pulls at the tool. It needs neither package: it has the methods that
-    both ask for, and finds joints in the `model` of their configurations by name, of Pinocchio or MuJoCo.
+    Use this task in a list of tasks or constraints, in place of a posture task. The tool's task does not disturb xi, so
+    both are met together, whereas a posture task pulls the tool away. The class needs neither package. It has the
+    methods that both call, and finds joints by name in the `model` of a configuration, of Pinocchio or MuJoCo.
 
     Args:
         chart: a chart with a closed expression, of the arm in the model.
-        cost: for errors of xi, one number or (r,), >= 0, as in their tasks.
+        cost: cost of errors of xi, one number or (r,), >= 0, as in tasks of pink and mink.
         gain: share of the error that a step removes, 0 to 1.
-        lm_damping: their Levenberg-Marquardt damping, >= 0.
-        joints: names in the model of the chart's joints; default: those of the chart's robot.
+        lm_damping: Levenberg-Marquardt damping as in pink and mink, >= 0.
+        joints: names of the chart's joints in the model; default: their names in the chart's robot.
 
     Raises:
         NoExpressionError: for grown charts.
@@ -152,9 +152,9 @@ class XiTask(Shown):
         self.joints = chart.problem.robot.joint_names if joints is None else tuple(joints)
         require_shape("joints", (len(self.joints),), (chart.n,))
         self.target_xi: Array | None = None
-        # Turns of joints that turn without end count from the last position.
+        # Last position, from which turns of joints without limits are counted.
         self._last: Array | None = None
-        # The last model, and the places of joints in it: looking them up takes longer than xi.
+        # The last model and its joint indices are kept, because a look-up takes longer than xi.
         self._of_model: tuple[Any, list[tuple[Any, int]]] = (None, [])
 
     def facts(self) -> dict[str, str]:
@@ -164,20 +164,20 @@ class XiTask(Shown):
         return {"task": f"{labels}, cost {number_list(self.cost)}, gain {self.gain:g}", "target": target}
 
     def set_target(self, xi: ArrayLike) -> None:
-        """Wanted coordinates xi_d, (r,)."""
+        """Set the desired coordinates xi_d, (r,)."""
         target = as_float_array("xi", xi)
         require_shape("xi", target.shape, (self.chart.r,))
         self.target_xi = target.copy()
 
     def set_target_from_configuration(self, configuration: Any) -> None:
-        """Keep the coordinates of a configuration."""
+        """Set the target to the coordinates of a configuration."""
         self.target_xi = self.chart.xi(self._read_position(configuration))
 
     def compute_error(self, configuration: Any) -> Array:
-        """e (r,), by the shorter way around for circle-valued coordinates.
+        """e (r,), the shorter way around for circle-valued coordinates.
 
         Raises:
-            InvalidValueError: before a target is set, or if the model has no joint of a name.
+            InvalidValueError: before a target is set, or if the model lacks one of the joints.
         """
         if self.target_xi is None:
             raise InvalidValueError("target of the task", "none", "one from `set_target`")
@@ -192,7 +192,7 @@ class XiTask(Shown):
         return J
 
     def compute_qp_residual(self, configuration: Any) -> tuple[Array, Array, float]:
-        """Weighted J, weighted -gain e, and the damping mu = lm_damping |that|^2; mink calls it."""
+        """Weighted J, weighted residual r = -gain e, and the damping mu = lm_damping |r|^2; mink calls it."""
         error = -self.gain * self.cost * self.compute_error(configuration)
         J = self.cost[:, None] * self.compute_jacobian(configuration)
         return J, error, self.lm_damping * float(error @ error)
@@ -206,13 +206,13 @@ class XiTask(Shown):
         """The chart's joint positions, (n,)."""
         q = configuration.q
         values = (q[place] for place, _ in self._find_places(configuration.model))
-        # Pinocchio stores joints that turn without end as cosine and sine.
+        # Pinocchio stores revolute joints without limits as cosine and sine.
         q = np.array([value if np.ndim(value) == 0 else np.arctan2(value[1], value[0]) for value in values])
         self._last = q if self._last is None else np.asarray(self.chart.problem.unwrap(q, self._last))
         return self._last
 
     def _find_places(self, model: Any) -> list[tuple[Any, int]]:
-        """For each joint its place in q, a slice for joints that Pinocchio stores as cosine and sine, and in dq."""
+        """Indices of each joint in q and in dq; in q, a slice for joints that Pinocchio stores as cosine and sine."""
         if model is self._of_model[0]:
             return self._of_model[1]
         # MuJoCo's models have other attributes than Pinocchio's.

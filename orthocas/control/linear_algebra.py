@@ -20,10 +20,10 @@ SOFTEST = 1e-6  #: smallest squared frequency in double_diagonal, relative to th
 def invert_spd(matrix: Expression) -> tuple[Any, Any]:
     """Inverse and determinant of a symmetric positive definite matrix (k, k), without pivoting.
 
-    NaN or infinite where the matrix is singular. SX are written out, by L D L^T; graphs (MX) have loops instead, whose
-    code does not grow with k.
+    The results are NaN or infinite if the matrix is singular. SX expressions are written out by L D L^T. MX graphs use
+    loops, whose code does not grow with k.
     """
-    # Graphs in loops, expressions written out.
+    # Use loops for graphs, and written-out code for expressions.
     k = matrix.shape[0]
     if k == 1:
         return 1 / matrix, matrix
@@ -39,7 +39,7 @@ def invert_spd(matrix: Expression) -> tuple[Any, Any]:
 
 @cache
 def _build_sweeps(k: int) -> ca.Function:
-    """Inverse and determinant of A (k, k) by k sweeps: each pivots on the first entry, and moves it to the end.
+    """Inverse and determinant of A (k, k) by k sweeps; each pivots on the first entry and moves it to the end.
 
     A sweep turns [[p, w^T], [w, R]] into [[R - w w^T / p, w / p], [w^T / p, -1 / p]]; k of them lead to -A^-1.
     """
@@ -59,8 +59,8 @@ def multiply_by_root(matrix: Expression, vectors: Expression) -> Expression:
     """S V with the symmetric positive definite S, S S = A, for A (k, k) and V (k, c).
 
     Newton's iteration in the product form of Denman and Beavers, scaled by determinants, with a fixed number of rounds;
-    generated C stops as soon as the rest is below rounding. All matrices of the rounds commute, so that V takes the
-    place of S. The result is a rational function of the entries and of roots of determinants.
+    generated C stops as soon as the residual is below rounding. All matrices of the iteration commute, so it can work
+    on S V instead of S. The result is a rational function of the entries and of roots of determinants.
 
     Source:
         [H2008] Sec. 6.3, product form of the Denman-Beavers iteration with determinantal scaling.
@@ -80,7 +80,7 @@ def _build_rounds(k: int, c: int) -> ca.Function:
     next_result = ca.sqrt(mu_squared) * (result + inverse @ result / mu_squared) / 2
     next_product = (identity + (mu_squared * product + inverse / mu_squared) / 2) / 2
     newton_round = ca.Function("newton_round", [product, result], [_mirror(next_product), ca.densify(next_result)])
-    # All rounds call the same function, from X = A and A V on.
+    # All rounds call the same function, and start from X = A and A V.
     A, V = ca.MX.sym("A", k, k), ca.MX.sym("V", k, c)
     X, SV = A, A @ V
     for _ in range(ROUNDS):
@@ -94,7 +94,7 @@ def _mirror(matrix: Any) -> Any:
 
 
 def choose_kind(k: int) -> Any:
-    """SX for matrices with few rows, which are fastest written out; MX for others, which then take C too long."""
+    """SX for few rows, which are fastest written out; MX for larger ones, which C compiles too slowly as SX."""
     return ca.SX if k <= WRITTEN_OUT else ca.MX
 
 
@@ -102,10 +102,10 @@ def build_block_inertia(n: int, blocks: tuple[int, ...]) -> ca.Function:
     """J (k, n), A (n, n) -> B = A^-1 J^T (n, k), Lambda (k, k), volume (1, 1).
 
     The rows of J are divided into blocks, k = sum(blocks). Lambda is block diagonal with (J_b A^-1 J_b^T)^-1, [AS2023]
-    eqs. (30), (31); one block gives the full M_phi. The volume is the product of det(J_b A^-1 J_b^T), which is 0 in
-    singularities.
+    eqs. (30), (31); one block gives the full M_phi. The volume is the product of det(J_b A^-1 J_b^T), which is 0 at
+    singular positions.
     """
-    # A block of rows of J after the other.
+    # Invert one block of rows of J after the other.
     k = sum(blocks)
     kind = choose_kind(n)
     J, A = kind.sym("J", k, n), kind.sym("A", n, n)
@@ -145,19 +145,19 @@ def apply_damping(
     - double_diagonal: D = 2 Z^1/2 (M # K) Z^1/2, always positive semi-definite, with the geometric mean
       M # K = K^1/2 (K^-1/2 M K^-1/2)^1/2 K^1/2. With one damping ratio z for all coordinates, D is diagonal in the
       generalised eigenvectors of (K, M), and every mode has the damping ratio z. A spring softer than `SOFTEST` of
-      the stiffest one, also K_i = 0, is damped as if it had that stiffness, so hardly.
+      the stiffest one, also K_i = 0, is damped as if it had that stiffness, which is very little.
 
     Source:
         square_root: [AS2023] eq. (29); double diagonalisation: [AOFH2003]; its form without eigenvectors and for
         several ratios is ours, docs/explanation/derivations_control.md#damping.
     """
-    # Both products with the root are one, of matrices side by side.
+    # Multiply both matrices, side by side, by the root at once.
     c = velocities.shape[1]
     if design == "square_root":
         weight = ca.repmat(damping_ratio * ca.sqrt(stiffness), 1, c)
         both = multiply_by_root(inertia, ca.horzcat(weight * velocities, velocities))
         return both[:, :c] + weight * both[:, c:]
-    # Squared frequencies K_i / M_ii are at least as large as the rounds of the square root can resolve. K_i < 0 and NaN
+    # Raise squared frequencies K_i / M_ii to the least that the rounds of the square root can resolve. K_i < 0 and NaN
     # stay invalid.
     mass = ca.diag(inertia)
     floor = mass * ca.fmax(SOFTEST * ca.mmax(stiffness / mass), SOFTEST**2)
