@@ -146,7 +146,7 @@ class BasisObjective:
         def sum_part(run: Run, part: slice) -> tuple[float, Array]:
             value, gradient = 0.0, np.zeros(T.shape)
             losses, slopes = np.empty(COLUMNS), np.empty((self.n * self.r, COLUMNS))
-            # one block at a time, so that X leaves memory only once
+            # One block at a time, so that X leaves memory only once
             for X, share, *data in zip(*(array[part] for array in arrays), strict=True):
                 run([(T @ X).astype(np.float64, copy=False), *data], [losses, slopes])
                 value += float(losses @ share)
@@ -170,7 +170,7 @@ class BasisObjective:
         With n joints, r coordinates have about r n^2 / 2 coefficients. The whole matrix takes n^6 operations, and n^9
         to factor. Its blocks, one for each coordinate, take n^5 and n^7.
         """
-        # as few samples as leave enough residuals for each coefficient
+        # As few samples as leave enough residuals for each coefficient
         residuals = self.N * (self._loss.smooth_count or 1)
         rough = RULES.rough if self._loss.sizes.identity_metric else RULES.rough_in_metric
         stride = RULES.stride
@@ -180,12 +180,12 @@ class BasisObjective:
 
     def hessian(self, theta: Array) -> Array:
         """d^2L/dtheta^2, exact, (size, size)."""
-        # second derivatives with respect to J_xi at each sample, then the gradients of the basis on both sides
+        # Second derivatives with respect to J_xi at each sample, then the gradients of the basis on both sides
         r, n, K = self.r, self.n, self.K
         (curvature,) = build_curvature_columns(self._loss)(self._evaluate_jacobians(theta), *self._data)
         W = split_by_sample(curvature.reshape(-1, n * r, n * r, curvature.shape[2]), self.N).reshape(-1, n, r, n, r)
         G, H = self._dense, np.zeros((r, K, r, K))
-        # each pair of coordinates is a block, filled by one thread
+        # Each pair of coordinates is a block, filled by one thread
 
         def fill(pair: tuple[int, int]) -> None:
             i, j = pair
@@ -196,7 +196,7 @@ class BasisObjective:
             H[j, :, i] = H[i, :, j].T
 
         run_in_threads(fill, [(i, j) for i in range(r) for j in range(i + 1)])
-        # coefficients that may differ from zero
+        # Coefficients that may differ from zero
         free = self.kept.ravel()
         block: Array = H.reshape(r * K, r * K)[np.ix_(free, free)]
         return block
@@ -276,11 +276,11 @@ class BasisObjective:
         free, rows = int(self.kept.sum()), self._loss.smooth_rows
         H = np.zeros((free, free))
         if smooth:
-            # blocks of coordinate pairs, from few rows per sample in single precision
+            # Blocks of coordinate pairs, from few rows per sample in single precision
             shared = [(i, j, rows[i].index(row), rows[j].index(row)) for i, j, row in self._loss.shared_rows]
             gradients = self._thin(stride)
             H = build_normal_matrix(smooth, gradients, shared) / len(gradients[0])
-        # a hinge couples all coordinates, but acts at few samples
+        # A hinge couples all coordinates, but acts at few samples
         for D, G, count in hinges:
             active = (D @ G)[:, self.kept]
             H += (active.T @ active).astype(float) / count
@@ -297,7 +297,7 @@ class BasisObjective:
             if smooth:
                 gradients = self._thin(stride)[j : j + 1]
                 H = build_normal_matrix(smooth[j : j + 1], gradients, ()) / len(gradients[0])
-            # a hinge couples coordinates; here each keeps its own part
+            # A hinge couples coordinates; here each keeps its own part
             for D, G, count in hinges:
                 active = (D[:, j : j + 1] @ G)[:, 0, self.kept[j]]
                 H += (active.T @ active).astype(float) / count
@@ -308,7 +308,7 @@ class BasisObjective:
     def _build_by_arrays(self, theta: Array, stride: int) -> list[Array]:
         """The same blocks from the squares D^T D of all residuals at every `stride`-th sample."""
         if not self._loss.smooth_count:
-            # hinges alone have one residual a sample, so they need more of them
+            # Hinges alone have one residual a sample, so they need more of them
             stride = 1
             while stride * RULES.hinges < self.N:
                 stride *= 2
@@ -317,7 +317,7 @@ class BasisObjective:
         J = (self._table(theta) @ X).astype(np.float64, copy=False).reshape(len(X), self.n * self.r, -1)
         data = [array[..., ::stride] for array in self._data]
         blocks = [loss.build_curvatures(J[b], [array[b] for array in data]) for b in range(len(X))]
-        # without the padding of the last block
+        # Without the padding of the last block
         count = -(-self.N // stride)
         squares = [np.concatenate(parts)[:count] for parts in zip(*blocks, strict=True)]
         return [total / count for total in self._gradients.square(X, squares, self.kept)]
@@ -337,9 +337,9 @@ class BasisObjective:
                 blocks = derivative.reshape(len(derivative), self.n, -1, derivative.shape[2])
                 smooth.append(split_by_sample(blocks, self.N, stride).astype(np.float32))
         for residual, derivative in zip(derivatives[self.r :: 2], derivatives[self.r + 1 :: 2], strict=True):
-            # only samples at which the hinge acts, without the padding of the last block
+            # Only samples at which the hinge acts, without the padding of the last block
             block, column = np.nonzero((residual[:, 0] > 0) & (self._share > 0))
-            # where it acts at most samples, some of them estimate the matrix well enough
+            # Where it acts at most samples, some of them estimate the matrix well enough
             every = max(1, len(block) // RULES.hinges)
             block, column = block[::every], column[::every]
             D = derivative[block, :, column].reshape(-1, self.n, self.r).transpose(0, 2, 1).astype(np.float32)
@@ -371,7 +371,7 @@ def build_normal_matrix(derivatives: Sequence[Array], gradients: Sequence[Array]
     places = [slice(end - G.shape[2], end) for G, end in zip(gradients, ends, strict=True)]
     H = np.zeros((ends[-1], ends[-1]))
     chunks = range(0, len(gradients[0]), RULES.chunk)
-    # so many chunks at a time that there is work for all threads
+    # So many chunks at a time that there is work for all threads
     together = ceil(count_threads() / r)
     for k in range(0, len(chunks), together):
         _add(H, places, chunks[k : k + together], derivatives, gradients, shared)
@@ -407,7 +407,7 @@ def _add(
             for row, other in rows_of[i, j]:
                 H[places[i], places[j]] += X[start, i][:, row].T @ X[start, j][:, other]
 
-    # rows of samples times gradients first, then squares and mixed products of them, each a block of the matrix
+    # Rows of samples times gradients first, then squares and mixed products of them, each a block of the matrix
     r = len(derivatives)
     rows_of: dict[tuple[int, int], list[tuple[int, int]]] = {}
     for i, j, row, other in shared:
@@ -419,7 +419,7 @@ def _add(
     run_in_threads(lambda block: block(), work)
 
 
-# blocks of samples at a time, so that the memory never holds all of them twice
+# Blocks of samples at a time, so that the memory never holds all of them twice
 _PART = 16
 
 
@@ -534,15 +534,15 @@ class ProductGradients(BasisGradients):
     def __init__(self, family: ProductFamily, n: int, dtype: DTypeLike = np.float64) -> None:
         super().__init__(family, n, dtype)
         matrices = [family.build_derivative_matrix(i)[1:] for i in range(n)]
-        # places of psi' in (1, psi)
+        # Places of psi' in (1, psi)
         self._places = np.unique(np.concatenate([D.indices for D in matrices]))
         matrices = [D[:, self._places] for D in matrices]
-        # all D_i, (n K, S)
+        # All D_i, (n K, S)
         self._upright = scipy.sparse.vstack(matrices).tocsr()
-        # all D_i^T, (n S, K)
+        # All D_i^T, (n S, K)
         self._lying = scipy.sparse.vstack([D.T for D in matrices]).tocsr()
         self._back = self._lying.T.tocsr()
-        # rows of all D_i for some of the functions, so far
+        # Rows of all D_i for some of the functions, so far
         self._parts: dict[tuple[bytes, str], Any] = {}
 
     @property
@@ -568,7 +568,7 @@ class ProductGradients(BasisGradients):
         assert X.shape[3] % every == 0
         kind = X.dtype if dtype is None else np.dtype(dtype)
         values = X[:, 0, :, ::every].transpose(1, 0, 2).reshape(X.shape[2], -1)[:, : -(-samples // every)]
-        # the rows of these functions in all D_i, (n kept, S), kept for the next time
+        # The rows of these functions in all D_i, (n kept, S), kept for the next time
         key = kept.tobytes(), kind.str
         if key not in self._parts:
             self._parts[key] = self._upright[np.tile(kept, self.n)].astype(kind)
@@ -578,11 +578,11 @@ class ProductGradients(BasisGradients):
     def square(self, X: Array, squares: Sequence[Array], kept: NDArray[np.bool_]) -> list[Array]:
         """Sums of W_j psi' psi'^T where these are smaller, then D_i on both sides."""
         n, S = self.n, X.shape[2]
-        # where terms have several factors, psi' psi'^T has as many entries as products of gradients
+        # Where terms have several factors, psi' psi'^T has as many entries as products of gradients
         if n * (n + 1) // 2 * (S * (S + 1) // 2) >= n * int(kept.sum(axis=1).max()) ** 2:
             return super().square(X, squares, kept)
         values = X[:, 0].transpose(0, 2, 1).reshape(-1, S)[: len(squares[0])].astype(np.float32)
-        # both factors are symmetric: half of their entries
+        # Both factors are symmetric: half of their entries
         (i, j), (s, t) = np.triu_indices(n), np.triu_indices(S)
         entries = np.concatenate([W[:, i, j].astype(np.float32).T for W in squares])
         sums, piece = np.zeros((len(entries), len(s)), dtype=np.float32), max(1, RULES.products // len(s))
@@ -653,7 +653,7 @@ class SparseGradients(BasisGradients):
         """The numbers in their places."""
         B, n, _, c = X.shape
         assert c % every == 0
-        # each joint's numbers, at the places that its functions have among those asked for
+        # Each joint's numbers, at the places that its functions have among those asked for
         place = np.cumsum(kept) - 1
         dense = np.zeros((B, c // every, n, kept.sum()), dtype=X.dtype if dtype is None else dtype)
         for i, functions in enumerate(self.terms_of_joints):

@@ -96,7 +96,7 @@ class Resampled:
         """The mean over `size` samples drawn from all, `count` times."""
         rng, size = np.random.default_rng(seed), min(size, self._count)
         while count > 0:
-            # all samples are gathered once in a random order: parts of them need no copies
+            # All samples are gathered once in a random order: parts of them need no copies
             shuffled = self._whole.part(rng.permutation(self._count)[: count * size])
             for start in range(0, min(count * size, self._count - size + 1), size):
                 yield shuffled.part(slice(start, start + size))
@@ -118,9 +118,9 @@ def bound_mutual_angles(
     fitted = len(pairs(objective.r))
     if not fitted:
         raise InvalidValueError("max_mutual_deg", "given", "a problem with two or more coordinates to fit")
-    # pairs with an idle joint are exactly orthogonal, so the other pairs may use their part
+    # Pairs with an idle joint are exactly orthogonal, so the other pairs may use their part
     bounded = BoundedMutual(objective, bound * (len(pairs(r)) / fitted) ** 0.5)
-    # solve the weighted problem first: minima far from its own are worse
+    # Solve the weighted problem first: minima far from its own are worse
     if fresh:
         weighted = replace(objective.weights, mutual=DEFAULT_WEIGHTS.mutual)
         theta = GaussNewton().minimise(objective.reweigh(weighted), theta).require_finished().theta
@@ -146,7 +146,7 @@ class BoundedMutual:
     """
 
     def __init__(self, objective: BasisObjective, bound: float) -> None:
-        # the basis is sampled once, and shared by the objectives below
+        # The basis is sampled once, and shared by the objectives below
         weights, self._gram = objective.weights, objective.gram
         self._task = objective.reweigh(Weights(weights.task, 0.0, weights.regularity, angles=weights.angles))
         # 2 cancels the factor 1/2 of the loss

@@ -140,7 +140,7 @@ def compare(
     folder = None if charts is None else as_path("charts", charts)
     if folder is not None:
         require_writable(folder / "chart", ChartFileError)
-        # charts that cannot be saved are refused before the first fit
+        # Charts that cannot be saved are refused before the first fit
         for parametrisation in families:
             parametrisation_to_data(parametrisation.for_problem(problem))
     elif control_ticks:
@@ -172,10 +172,10 @@ def _list_weights(
     """The weights of a grid, one or several."""
     if weights is None:
         return [default]
-    # one set of weights may be numbers or an object
+    # One set of weights may be numbers or an object
     if isinstance(weights, Weights) or not any(isinstance(each, Weights | Sequence) for each in weights):
         return [Weights.of(cast(Weights | WeightNumbers, weights))]
-    # several are told apart by their labels
+    # Several are told apart by their labels
     several = [Weights.of(cast(Weights | WeightNumbers, each)) for each in weights]
     labels = [each.label for each in several]
     if twice := [label for label in labels if labels.count(label) > 1]:
@@ -198,12 +198,12 @@ def _build_cells(
     """
     cells = []
     for parametrisation in parametrisations:
-        # closed forms have one fit for all solvers, weights and seeds
+        # Closed forms have one fit for all solvers, weights and seeds
         closed = parametrisation.closed_form is not None
         fitting = [choose_solver(parametrisation, first.problem)] if closed or solvers is None else solvers
         for solver, loss, seed in product(fitting, losses[:1] if closed else losses, range(1 if closed else seeds)):
             cell = replace(first, parametrisation=parametrisation, solver=solver, weights=loss, seed=seed)
-            # a chart file for each cell, refused before the first fit if it exists
+            # A chart file for each cell, refused before the first fit if it exists
             if folder is not None:
                 words = [parametrisation.label, solver.name if first.branch is None else WIDE, str(seed)]
                 words += [cell.weights_label] if len(losses) > 1 else []
@@ -221,7 +221,7 @@ def _check_grid(
     families: Any = parametrisations
     if isinstance(parametrisations, list | tuple):
         families = [parse_parametrisation(one) if isinstance(one, str) else one for one in parametrisations]
-    # members of the right kind, and names that differ: tables and files go by them
+    # Members of the right kind, and names that differ: tables and files go by them
     for name, members, kinds, example in (
         ("parametrisations", families, Parametrisation, "Polynomial(degree=4)"),
         ("solvers", [GaussNewton()] if solvers is None else solvers, Solver, "GaussNewton()"),
@@ -339,7 +339,7 @@ def run_cell(cell: Cell) -> CellResult:
     history: list[tuple[float, float]] = []
     stages: list[str] = []
     start = time.perf_counter()
-    # losses over time, of the last stage only
+    # Losses over time, of the last stage only
 
     def record(progress: Progress) -> None:
         if progress.stage not in stages:
@@ -348,7 +348,7 @@ def run_cell(cell: Cell) -> CellResult:
         if math.isfinite(progress.value):
             history.append((time.perf_counter() - start, progress.value))
 
-    # a failure of any kind is a result of its cell, and leaves the others alone
+    # A failure of any kind is a result of its cell, and leaves the others alone
     try:
         result = cell.fit(record)
         if cell.chart_file is not None:
@@ -521,7 +521,7 @@ class Comparison(Shown):
         Raises:
             ArchiveError: if there are others, or symbolic links.
         """
-        # the table for programs that read CSV, and everything as JSON
+        # The table for programs that read CSV, and everything as JSON
         names = [field.name for field in fields(CellResult) if field.name != "history"]
         text = io.StringIO(newline="")
         writer = csv.DictWriter(text, names)
@@ -589,7 +589,7 @@ def summarise(results: Sequence[CellResult]) -> Summary:
     """Medians over the seeds of one parametrisation, solver and weights."""
     good = [result for result in results if not result.failed]
     first = (good or results)[0]
-    # medians of the seeds that worked, and how far these lie apart
+    # Medians of the seeds that worked, and how far these lie apart
 
     def compute_median(name: str) -> float:
         return median(float(getattr(result, name)) for result in good) if good else math.nan
@@ -625,13 +625,13 @@ def _describe(s: Summary) -> str:
 
 def _row(s: Summary) -> dict[str, str]:
     """The cells of a row by their columns; the last one of a short row may be long."""
-    # failed seeds are counted beside the solver; if all failed, the row ends with the reason
+    # Failed seeds are counted beside the solver; if all failed, the row ends with the reason
     failed = f" ({s.failed} of {s.seeds} failed)" if 0 < s.failed < s.seeds else ""
     names = {"parametrisation": s.parametrisation, "solver": s.solver + failed, "weights": s.weights}
     if s.failed == s.seeds:
         return {**names, "error": f"failed: {s.error}"}
     several = s.seeds - s.failed > 1
-    # values with their spread over seeds
+    # Values with their spread over seeds
 
     def angle(value: float, spread: float) -> str:
         if math.isnan(value):

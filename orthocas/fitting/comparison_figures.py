@@ -78,7 +78,7 @@ def _wide_front_figure(comparison: "Comparison") -> Figure:
     upper, lower = figure.subplots(2, 1, sharex=True)
     summaries = [summary for summary in comparison.summaries() if summary.failed < summary.seeds]
     colours = _colours([result for result in comparison.results if not result.failed])
-    # a line for each parametrisation, a point for each set of weights
+    # A line for each parametrisation, a point for each set of weights
     for name, colour in colours.items():
         own = [summary for summary in summaries if summary.parametrisation == name]
         leaks = [summary.leak_rms_deg for summary in own]
@@ -156,7 +156,7 @@ def _key(summary: "Summary") -> tuple[str, str, str]:
 
 def _label(axes: Axes, summaries: "Sequence[Summary]", single: bool, colours: Mapping[str, Colour]) -> None:
     """Write each parametrisation once, beside its least task angle; labels that would touch move up or down."""
-    # summaries come with the least task angle first
+    # Summaries come with the least task angle first
     best: dict[str, Summary] = {}
     for summary in summaries:
         best.setdefault(summary.parametrisation, summary)
@@ -169,7 +169,7 @@ def _label(axes: Axes, summaries: "Sequence[Summary]", single: bool, colours: Ma
     frame = axes.get_window_extent()
     low, high, end = scale * frame.y0 + _HIGH / 2, scale * frame.y1 - _HIGH / 2, scale * frame.x1
     for name, summary in sorted(best.items(), key=lambda entry: points[_key(entry[1])][1]):
-        # on the right if there is room, at a height where nothing else is
+        # On the right if there is room, at a height where nothing else is
         x, y = points[_key(summary)]
         wide = _LETTER * len(name)
         side = 1 if x + _ASIDE + wide < end else -1

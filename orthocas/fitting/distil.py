@@ -89,7 +89,7 @@ def distil(
         raise InvalidValueError(
             "parametrisation", repr(parametrisation), "a parametrisation that can be fitted, such as Polynomial(6)"
         )
-    # the family: circle-valued ones are fitted by cosine and sine
+    # The family: circle-valued ones are fitted by cosine and sine
     require_kind("chart", chart, Chart)
     watch = Watch(monitor, f"distil {parametrisation.label}")
     if not isinstance(chart.coordinates, GrownCoordinates):
@@ -110,22 +110,22 @@ def distil(
     if count * (1 + chart.n) <= family.size / chart.r:
         raise InvalidValueError("samples", count, f"enough for the {family.size // chart.r} parameters of a coordinate")
     require_memory(f"distilling with {count} samples", 8.0 * count * chart.n * (chart.n + 4))
-    # values and gradients of the grown chart at the samples that have them
+    # Values and gradients of the grown chart at the samples that have them
     points = sample_evenly(chart.problem.domain, count, require_count("seed", seed, least=0))
     targets = _sample_targets(chart, points)
     own_targets = targets
     if circle is not None:
-        # cosines, then sines of angles, and their gradients
+        # Cosines, then sines of angles, and their gradients
         c, s, g = np.cos(targets.xi), np.sin(targets.xi), targets.gradients
         gradients = np.concatenate([-s[:, :, None] * g, c[:, :, None] * g], axis=1)
         own_targets = replace(targets, xi=np.concatenate([c, s], axis=1), gradients=gradients)
-    # bases by least squares, networks by a minimiser
+    # Bases by least squares, networks by a minimiser
     if isinstance(family, LinearFamily):
         theta, offset = _solve_least_squares(family, own_targets, watch)
     else:
         minimiser = LBFGS(max_iterations=500, tolerance=1e-9) if solver is None else solver
         result = minimiser.minimise(_Distance(family, own_targets), family.initial(seed), watch).require_finished()
-        # the output bias of a network includes the offset
+        # The output bias of a network includes the offset
         theta, offset = result.theta, np.zeros(family.outputs)
     if circle is not None:
         theta, offset = np.concatenate([theta, -offset[: circle.constants]]), np.zeros(chart.r)
@@ -180,13 +180,13 @@ def _sample_targets(chart: Chart, points: Array) -> _Targets:
 
 
 def _evaluate(chart: Chart, distilled: Chart, targets: _Targets, count: int) -> Distilled:
-    # fresh samples that the fit has not seen
+    # Fresh samples that the fit has not seen
     held_out = sample_uniform(chart.problem.domain, min(count, RULES.held_out), RULES.held_out_seed)
     held_out_targets = _sample_targets(chart, held_out)
     errors = wrap_shortest(
         distilled.coordinates.xi(held_out_targets.points) - held_out_targets.xi, distilled.parts.turns[chart.m :]
     )
-    # angles between gradients, as lengths of differences over the lengths
+    # Angles between gradients, as lengths of differences over the lengths
     gradients = held_out_targets.gradients / held_out_targets.weight
     turned = np.linalg.norm(distilled.coordinates.jacobian(held_out_targets.points) - gradients, axis=2)
     relative = turned / np.linalg.norm(gradients, axis=2)
@@ -202,12 +202,12 @@ def _evaluate(chart: Chart, distilled: Chart, targets: _Targets, count: int) -> 
 
 def _solve_least_squares(family: LinearFamily, targets: _Targets, watch: Watch) -> tuple[Array, Array]:
     """Coefficients and offset of the best linear combination, by normal equations over chunks of samples."""
-    # values and gradients of the basis at a sample, with a column for the constant
+    # Values and gradients of the basis at a sample, with a column for the constant
     n, K = targets.points.shape[1], family.width
     q = ca.SX.sym("q", n)
     basis = family.basis(q)
     both = Batched(dense_function("basis", [q], [basis, ca.jacobian(basis, q)]))
-    # normal equations, summed up part by part so that no part fills the memory
+    # Normal equations, summed up part by part so that no part fills the memory
     normal, right = np.zeros((K + 1, K + 1)), np.zeros((K + 1, family.outputs))
     for start in range(0, len(targets.points), RULES.chunk):
         part = slice(start, start + RULES.chunk)
@@ -229,7 +229,7 @@ class _Distance:
     def __init__(self, family: Family, targets: _Targets) -> None:
         N, n = targets.points.shape
         r = family.outputs
-        # the mean square distance of values and weighted gradients, and its gradient after theta
+        # The mean square distance of values and weighted gradients, and its gradient after theta
         theta, q = ca.MX.sym("theta", family.size), ca.MX.sym("q", n, N)
         values, slopes = ca.MX.sym("values", r, N), ca.MX.sym("slopes", r * n, N)
         gradients = ca.vertcat(*family.jacobian(q, theta)) * targets.weight
@@ -238,7 +238,7 @@ class _Distance:
         gradient = ca.jtimes(distance, theta, ca.MX(1), True)
         self._value = NumpyGraph("distance", inputs, [distance])
         self._both = NumpyGraph("distance_and_gradient", inputs, [distance, ca.densify(gradient)])
-        # the data of the samples, as NumPy's products take them
+        # The data of the samples, as NumPy's products take them
         self._data = [np.ascontiguousarray(part) for part in (targets.points, targets.xi, targets.gradients)]
         self._data[2] = self._data[2].reshape(N, r * n)
 

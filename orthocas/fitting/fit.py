@@ -133,7 +133,7 @@ def fit(
         >>> fit.chart.xi([0.6, 0.8, 0.8]).shape
         (1,)
     """
-    # a robot and its task make a problem; after a problem, the parametrisation has the second place
+    # A robot and its task make a problem; after a problem, the parametrisation has the second place
     if isinstance(problem, Robot):
         of_robot: Any = task
         problem = Problem(problem, of_robot, metric, domain)
@@ -172,7 +172,7 @@ def _fit(
 ) -> Fit:
     """Fit with settings that are checked."""
     start = time.perf_counter()
-    # the domain that the family asks for, and whether the task can be regular there
+    # The domain that the family asks for, and whether the task can be regular there
     parametrisation = settings.parametrisation
     warn_unless_savable(parametrisation)
     if isinstance(parametrisation, CyclicParametrisation) and parametrisation.cyclic:
@@ -185,7 +185,7 @@ def _fit(
     with remembered() as pressed:
         problem_check = check(problem, seed=settings.seed)
         samples = sample_problem(problem, RULES.first, (settings.seed, RULES.first_tag))
-        # closed forms need no minimisation; others run the stages of `orthocas.fitting.stages`
+        # Closed forms need no minimisation; others run the stages of `orthocas.fitting.stages`
         if parametrisation.closed_form is not None:
             values, solution = parametrisation.closed_form(problem), Solution((), parametrisation, None)
             r, space = problem.r, JointSpace.of(problem)
@@ -196,7 +196,7 @@ def _fit(
         else:
             singular = problem_check.singular_samples > 0
             solution, coordinates = _solve(problem, settings, monitor, samples, align_to, begin, singular)
-        # the chart, with what a reader of the fit asks first: idle joints, worst points, a smaller domain
+        # The chart, with what a reader of the fit asks first: idle joints, worst points, a smaller domain
         joints = [i for i in coordinates.idle if i not in problem.robot.tree.floating]
         result = Fit(
             chart=Chart(problem, coordinates, _write_notes(solution, settings)),
@@ -229,13 +229,13 @@ def _solve(
         none = np.zeros(0)
         coordinates = Coordinates(settings.parametrisation, space, idle, none, none, none)
         return Solution((), settings.parametrisation, None), coordinates
-    # coordinates are fitted in the joints that move the task; quantities to follow are one more term of the loss
+    # Coordinates are fitted in the joints that move the task; quantities to follow are one more term of the loss
     active = [i for i in range(problem.n) if i not in idle]
     like = None if settings.like is None else settings.like.build_term(problem, active)
     settings = settings if like is None else settings.add_term(like)
     folds = FoldSearch(problem, active, settings.fold_weight(problem), singular)
     solution = Continuation(problem, settings, active, monitor, folds, like, begin).run()
-    # angles leave free where xi is zero, how long its gradient is, the order and the signs
+    # Angles leave free where xi is zero, how long its gradient is, the order and the signs
     raw = Coordinates(solution.parametrisation, space, idle, solution.theta, np.zeros(r), np.ones(r))
     coordinates = normalise(raw, problem.domain.home, samples)
     if settings.like is not None:
@@ -252,7 +252,7 @@ def normalise(raw: Coordinates, origin: Array, samples: Samples) -> Coordinates:
         OrthocasError: if the gradient of a coordinate vanishes on the domain.
     """
     r = len(raw.offset)
-    # angles keep their period, so they are turned instead of scaled
+    # Angles keep their period, so they are turned instead of scaled
     if isinstance(raw.family, CircleFamily):
         return replace(raw, theta=raw.family.turned(raw.theta, raw.once("xi", origin[None, :])[0, :r]))
     lengths = np.linalg.norm(raw.once("jacobian", samples.points)[:, :r], axis=2).mean(axis=0)
@@ -269,10 +269,10 @@ def fix_gauge(coordinates: Coordinates, centre: Array) -> Coordinates:
     the positive direction. Coordinates that change places in the arm's mirror have the same mean; the one that moves
     the first joint on which they differ further comes first. Idle joints stay last.
     """
-    # the mean index of the joints that a coordinate moves, and the sign of its largest entry
+    # The mean index of the joints that a coordinate moves, and the sign of its largest entry
     g = coordinates.once("jacobian", centre[None, :])[0, : len(coordinates.offset)]
     size = (g**2).sum(axis=1)
-    # lengths of 0 belong to folds at the centre
+    # Lengths of 0 belong to folds at the centre
     moved = (g**2 @ np.arange(g.shape[1])) / np.where(size > 0, size, 1.0)
     largest = np.take_along_axis(g, np.abs(g).argmax(axis=1)[:, None], axis=1)[:, 0]
     signs = np.where(largest < 0, -1.0, 1.0)
@@ -300,7 +300,7 @@ def align(coordinates: Coordinates, chart: Chart, samples: Samples) -> Coordinat
         for J in (coordinates.jacobian(samples.points)[:, :fitted], chart.coordinates.jacobian(samples.points))
     )
     parallel = np.einsum("sin,sjn->ij", ours, theirs[:, :fitted]) / len(samples)
-    # the assignment of coordinates whose gradients are most parallel in the mean
+    # The assignment of coordinates whose gradients are most parallel in the mean
     theirs_in_order, order = scipy.optimize.linear_sum_assignment(-np.abs(parallel.T))
     signs = np.sign(parallel.T[theirs_in_order, order])
     back = np.empty(fitted)
@@ -358,13 +358,13 @@ def offer_clear_part(problem: Problem, check: ProblemCheck, worst: WorstPoints |
     Returns:
         The offer; None if nothing is wrong, if charts fail elsewhere too, or if the centre itself would be left out.
     """
-    # positions with a small conditioning, if the search found some
+    # Positions with a small conditioning, if the search found some
     domain = problem.domain
     failed = np.zeros((0, problem.n)) if worst is None else worst.below(RULES.failed)
     clear = domain.singular_bound
     if not (isinstance(domain, Box) and (domain.is_box or clear)) or not (len(failed) or check.singular_samples):
         return None
-    # the bound that leaves most of them out, in whole steps, unless it is too large
+    # The bound that leaves most of them out, in whole steps, unless it is too large
     try:
         measured = clear or ClearBox(domain, problem.task, RULES.any_bound)
         values = measured.singular_values(failed)

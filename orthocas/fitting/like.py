@@ -109,7 +109,7 @@ def take_exactly(problem: Problem, quantities: Like, exact: bool | None, counted
     if count < problem.r:
         what = f"given with {count} {'quantity' if count == 1 else 'quantities'}"
         raise InvalidValueError("exact", what, f"{problem.r} of them, one for each coordinate; or leave it out")
-    # the quantities themselves: not shifted, and not scaled
+    # The quantities themselves: not shifted, and not scaled
     domain, space, r = problem.domain, JointSpace.of(problem), problem.r
     coordinates = Coordinates(quantities.given, space, (), np.zeros(0), np.zeros(r), np.ones(r))
     inside = counted[domain.contains(counted)]
@@ -118,7 +118,7 @@ def take_exactly(problem: Problem, quantities: Like, exact: bool | None, counted
     except DomainError:
         if not exact:
             return None
-        # that they are nowhere regular is worse
+        # That they are nowhere regular is worse
         quantities.project(sample_problem(problem, RULES.held_out, RULES.held_out))
         turning = f"in the middle of branch '{problem.name}', self-motions do not change {listed(quantities.names)}"
         raise DomainError(f"{turning}: give a smaller box as branch, another branch, or another quantity") from None
@@ -128,14 +128,14 @@ def take_exactly(problem: Problem, quantities: Like, exact: bool | None, counted
 def build_quantity(robot: Robot, like: Quantity | str) -> tuple[str, ca.Function]:
     """Its name with a unit, and q (n, 1) -> the quantity (1, 1): a joint, the swivel, or a function of q."""
     q = ca.SX.sym("q", robot.n)
-    # by name: the swivel angle, or a joint
+    # By name: the swivel angle, or a joint
     if isinstance(like, str):
         require_known("like", like, (SWIVEL, *robot.joint_names))
         if like == SWIVEL:
             return f"{SWIVEL} [rad]", sew_angle(robot, "conventional")
         k = robot.joint_names.index(like)
         return f"{like} [{'m' if robot.tree.prismatic[k] else 'rad'}]", dense_function("like", [q], [q[k]])
-    # or any function of q with one value
+    # Or any function of q with one value
     value = build_expression("like", like, q)
     require_shape("like", value.shape, (1, 1))
     name = str(getattr(like, "__name__", ""))
@@ -173,7 +173,7 @@ class Like:
         """
         robot = problem.robot
         q = ca.SX.sym("q", robot.n)
-        # a task stands for its components, relative to the centre of the domain
+        # A task stands for its components, relative to the centre of the domain
         if isinstance(like, Task):
             if not like.robot.tree.equals(robot.tree):
                 raise InvalidValueError("like", "a task of another robot", "one of the problem's robot")
@@ -181,7 +181,7 @@ class Like:
             labels = zip(like.labels, like.units, strict=True)
             names = tuple(f"{label} [{unit}]" if unit else label for label, unit in labels)
             return cls(names, _require_arms(robot, q, like.smooth_function(q)))
-        # all else is one quantity, or several
+        # All else is one quantity, or several
         parts = [like] if isinstance(like, str) or not isinstance(like, Sequence) else like
         quantities = [build_quantity(robot, part) for part in parts]
         if not quantities:
@@ -249,7 +249,7 @@ class Like:
         whole[active] = q
         values = self.function(whole)
         slopes = dense_function("like_jacobian", [q], [ca.cse(ca.jacobian(values, q))])
-        # functions of a loss are kept by names
+        # Functions of a loss are kept by names
         return LikeTerm(
             f"like {hashlib.sha256(json.dumps(write_tape(slopes)).encode()).hexdigest()[:12]}", len(self.names), slopes
         )
@@ -262,7 +262,7 @@ class Like:
         """
         m, B = samples.task_jacobian.shape[1], _split_directions(samples)
         slopes = self.differentiate(samples.points) @ B
-        # what self-motions move of each quantity, and whether that is enough to tell them apart
+        # What self-motions move of each quantity, and whether that is enough to tell them apart
         left = slopes[:, :, m:]
         gram = np.einsum("skj,slj->kl", left, left) / len(left)
         squares, least = gram.diagonal(), RULES.still_motion**2
@@ -304,12 +304,12 @@ class Like:
         terms = []
         for k in range(len(self.names)):
             squares = (slopes[:, k, m:] ** 2).sum(axis=1)
-            # samples count alike, whatever the size of the quantity's rate there
+            # Samples count alike, whatever the size of the quantity's rate there
             even = 1 / (np.median(squares) + squares)
             if r == 1:
                 even *= slopes[:, k, m] * np.median(slopes[:, k, m]) > 0
             even *= (RULES.weight_of_one if r == 1 else RULES.weight_of_several) / even.sum() / np.median(squares)
-            # the quadratic form of coefficients that the mean square is
+            # The quadratic form of coefficients that the mean square is
             E, pull = np.zeros(()), np.zeros(())
             for j, part in enumerate(parts):
                 weighted = (shares[j] * even[:, None] * part).T
@@ -347,16 +347,16 @@ class Like:
         """What the first coordinate misses of the first quantity at samples of the domain, where it has a value."""
         samples = sample_problem(problem, RULES.held_out_of_meaning, (seed, RULES.held_out_of_meaning))
         value = Batched(self.function)(samples.points)[0].reshape(len(samples), -1)[:, 0]
-        # where both have a value, angles by the shorter way
+        # Where both have a value, angles by the shorter way
         own, left = self._compare_rates(coordinates, samples)
         finite = np.isfinite(value) & np.isfinite(left)
         xi, value = coordinates.once("xi", samples.points)[finite, 0], value[finite]
         period = float(self.periods[0])
         missed = wrap_shortest((xi - value)[:, None], np.array([period]))[:, 0]
         value = xi - missed
-        # how much of the quantity's rate is left along self-motions
+        # How much of the quantity's rate is left along self-motions
         slow, fast = np.quantile((left / own)[finite], RULES.quantiles)
-        # what no function of xi can explain
+        # What no function of xi can explain
         order = np.argsort(xi)
         monotone = scipy.optimize.isotonic_regression(value[order])
         return MeaningError(
@@ -436,7 +436,7 @@ class LikeTerm:
         C = theta.reshape(family.outputs, family.width)
         G = gradients.expand(gradients.at(samples.points), len(samples))
         Z = samples.null_basis
-        # components across the task
+        # Components across the task
         own = np.einsum("rk,snk,snz->szr", C, G, Z, optimize=True).reshape(-1, len(C))
         slopes = _require_finite(self.batched(samples.points)[0].reshape(len(samples), self.count, -1))
         targets = (slopes @ Z).transpose(0, 2, 1)

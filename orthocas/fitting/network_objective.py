@@ -43,7 +43,7 @@ class _SampledLoss(ABC):
         m, n = samples.task_jacobian.shape[1:]
         self._draw, self._orientation = draw, orientation
         self._loss = Loss.of(Sizes(n, m, family.outputs, samples.metric_inverse is None), weights.by_name)
-        # the start orients coordinates, at some of the samples
+        # The start orients coordinates, at some of the samples
         if orientation is None and (self._loss.oriented or weights.folds > 0):
             some = samples[: RULES.orienting]
             self._orientation = some.orientation(self._evaluate_jacobian(some.points, start))
@@ -126,12 +126,12 @@ class ArrayObjective(_SampledLoss):
 
     def value_and_gradient(self, theta: Array) -> tuple[float, Array]:
         """L(theta) and dL/dtheta."""
-        # each piece: gradients of the network, loss and slopes by CasADi, slopes back to theta
+        # Each piece: gradients of the network, loss and slopes by CasADi, slopes back to theta
         small, columns, sizes = self._round(theta), build_loss_columns(self._loss), self._loss.sizes
 
         def part(tools: tuple[Run, ArrayMemory], work: tuple[_Piece, Array]) -> float:
             (run, memory), (piece, result) = tools, work
-            # forward through the network, the loss of each sample on its gradients, and back
+            # Forward through the network, the loss of each sample on its gradients, and back
             J, back = self._family.pullback(piece.points, small, memory)
             entries = arrange_blocks(J)
             losses, slopes = np.empty(piece.shares.shape), np.empty_like(entries)
@@ -142,7 +142,7 @@ class ArrayObjective(_SampledLoss):
             back(split_by_sample(by_entry, len(J)), result)
             return float(np.vdot(losses, piece.shares))
 
-        # pieces of samples are shared by threads, and their gradients are added in one order
+        # Pieces of samples are shared by threads, and their gradients are added in one order
         threads = min(count_threads(), len(self._pieces))
         with columns.borrow(threads) as runs, self._memories.borrow(threads + 1) as (results, *memories):
             gradients = [results.array(f"piece {k}", small.shape, small.dtype) for k in range(len(self._pieces))]
@@ -189,7 +189,7 @@ class GraphObjective(_SampledLoss):
         draw: Draw,
         orientation: float | None = None,
     ) -> None:
-        # graphs by loss and number of columns; copies of the objective share them
+        # Graphs by loss and number of columns; copies of the objective share them
         self._family, self._graphs = family, dict[tuple[Loss, int], _LossGraph]()
         super().__init__(family, samples, weights, start, draw, orientation)
 
@@ -213,12 +213,12 @@ class GraphObjective(_SampledLoss):
         return J.reshape(len(points), self._family.outputs, -1)
 
     def _hold(self, points: Array, entries: Array, room: int) -> None:
-        # a graph for all samples at once, or for as many as stay in the cache
+        # A graph for all samples at once, or for as many as stay in the cache
         columns = ceil(room / ceil(room / max(1, RULES.graph // (self._family.outputs * self._family.width))))
         if (self._loss, columns) not in self._graphs:
             self._graphs[self._loss, columns] = _LossGraph(self._family, self._loss, columns)
         self._graph = self._graphs[self._loss, columns]
-        # points (c, n), data (entries, c) and shares (c,) of its columns; unused ones repeat samples with the weight 0
+        # Points (c, n), data (entries, c) and shares (c,) of its columns; unused ones repeat samples with the weight 0
         self._blocks = []
         for k in range(0, len(points), columns):
             own = k + np.arange(columns) % min(columns, len(points) - k)
@@ -230,7 +230,7 @@ class _LossGraph:
     """Loss and gradient of samples side by side: functions of theta, q (n, c), data (c, entries) and shares (c, 1)."""
 
     def __init__(self, family: Family, loss: Loss, columns: int) -> None:
-        # the graph of one sample's loss, replayed on columns of samples
+        # The graph of one sample's loss, replayed on columns of samples
         theta, q = ca.MX.sym("theta", family.size), ca.MX.sym("q", loss.sizes.n, columns)
         data = ca.MX.sym("data", columns, sum(symbol.numel() for symbol in loss.symbols()))
         share = ca.MX.sym("share", columns)
@@ -243,7 +243,7 @@ class _LossGraph:
             build_loss_with_slopes(loss).tape, [*entries, *(ca.horzsplit(data) if loss.data else [])]
         )
         weighted = [ca.horzcat(*(share * slope for slope in slopes[j::r])) for j in range(r)]
-        # chain rule, split at J_xi: the derivatives of the loss are one sample's graph, replayed on columns
+        # Chain rule, split at J_xi: the derivatives of the loss are one sample's graph, replayed on columns
         by_theta = ca.jtimes(ca.horzcat(*gradients), theta, ca.horzcat(*(part.T for part in weighted)), True)
         self._inputs, self._value, self._slope = [theta, q, data, share], ca.dot(share, values), ca.densify(by_theta)
 

@@ -201,21 +201,21 @@ class Prober:
             return self._evaluate(problem, lambda points: np.zeros((len(points), 0, len(self.active))))
         space = JointSpace.of(problem).restricted_to(self.active)
         family = Polynomial(RULES.degree, self.cyclic).family(space, self.outputs)
-        # the coordinates of an earlier box may do; if not, a fit begins from them
+        # The coordinates of an earlier box may do; if not, a fit begins from them
         with one_blas_thread():
             if self._start is not None and (enough is not None or leap):
                 quality = self._evaluate(problem, self._gradients(family, self._start.on(family)))
                 if leap or quality.keeps(enough):
                     self._kept = self._start if quality.keeps(enough) else self._kept
                     return quality
-            # even samples for the start, and more near faces and corners, where charts fail first
+            # Even samples for the start, and more near faces and corners, where charts fail first
             even = sample_evenly(problem.domain, RULES.training, RULES.seed)
             heavy = sample_boundary_weighted(problem.domain, RULES.near_faces, RULES.seed + 1)
             samples = evaluate_samples(problem, np.vstack([even, heavy])).restricted_to(self.active)
             with deferred():
                 known = self._start
                 start = find_spectral_start(family, samples[: len(even)]) if known is None else known.on(family)
-                # the loss of the fit that confirms the box
+                # The loss of the fit that confirms the box
                 if self._objective is None:
                     weights = replace(self.weights.for_problem(problem), length=0.0, extra={})
                     objective = BasisObjective(family, samples, weights, start, lambda count, seed: samples)
@@ -227,7 +227,7 @@ class Prober:
             elif known is None:
                 result = QuasiNewton().coarser().minimise(objective, start)
             else:
-                # the matrix of a box that is not much wider or narrower serves
+                # The matrix of a box that is not much wider or narrower serves
                 width, steered = family.space.half_width, self._steered
                 if steered is None or np.abs(np.log(width / steered.half_width)).max() > np.log(RULES.other):
                     self._steered = _Steered(objective, width, objective.curvature_estimate(start))
@@ -252,7 +252,7 @@ class Prober:
         if self._start is None:
             return None
         quadratic = Polynomial(RULES.degree, self.cyclic).family(family.space, self.outputs)
-        # linear coordinates cannot hold quadratic ones
+        # Linear coordinates cannot hold quadratic ones
         if not set(quadratic.terms) <= set(family.terms):
             return None
         return family.embed(self._start.on(quadratic), quadratic)
@@ -261,7 +261,7 @@ class Prober:
         """Least conditioning of the last coordinates on another domain, by descent; 1 if a fit finds it as soon."""
         if self._start is None or self.outputs < RULES.many:
             return 1.0
-        # coordinates of the last trial, as a chart would have them
+        # Coordinates of the last trial, as a chart would have them
         parametrisation = Polynomial(RULES.degree, self.cyclic)
         family = parametrisation.family(JointSpace.of(problem).restricted_to(self.active), self.outputs)
         idle = tuple(k for k in range(problem.n) if k not in self.active)
@@ -291,7 +291,7 @@ def evaluate_chart(chart: Chart, samples: int, seed: int) -> Quality:
     """Quality of a fitted chart, without its idle joints, on samples of its domain, many near faces and corners."""
     coordinates = chart.coordinates
     assert isinstance(coordinates, Coordinates)
-    # coordinates that were fitted, in the joints that they depend on
+    # Coordinates that were fitted, in the joints that they depend on
     fitted, active = len(coordinates.offset), coordinates.active
 
     def jacobian(points: Array) -> Array:
@@ -314,7 +314,7 @@ def evaluate_at(problem: Problem, points: Array, jacobian: Callable[[Array], Arr
         active: the active joints.
     """
     samples = evaluate_samples(problem, points)
-    # leaks count at uniform samples, conditioning at all of them
+    # Leaks count at uniform samples, conditioning at all of them
     J, own = jacobian(samples.points), samples.restricted_to(active)
     uniform = len(samples) - 2 * (len(samples) // 3)
     leaks, conditioning = compute_leak_and_conditioning(own, J)

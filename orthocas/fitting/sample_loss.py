@@ -25,7 +25,7 @@ from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array
 from orthocas.tools.columns import COLUMNS, ColumnFunction, Run
 
-# coordinates from which arrays are faster than what is written out
+# Coordinates from which arrays are faster than what is written out
 _BY_ARRAYS = 8
 
 
@@ -148,7 +148,7 @@ class Loss:
         """The coordinates that each row of `written_out` depends on."""
         if self.volume_terms:
             return self.written_out._touched
-        # a row depends on the coordinates whose entries of J_xi are in its sparsity pattern
+        # A row depends on the coordinates whose entries of J_xi are in its sparsity pattern
         J, data = self.arguments()
         by_entry = ca.jacobian(self.residuals(J, data), ca.vec(J)).sparsity()
         touched: list[set[int]] = [set() for _ in range(by_entry.size1())]
@@ -205,7 +205,7 @@ def build_residual_columns(loss: Loss) -> Callable[..., list[Array]]:
     J, data = loss.arguments()
     r, n = loss.sizes.r, loss.sizes.n
     rho = loss.residuals(J, data)
-    # its columns are the entries of J_xi, column by column
+    # Its columns are the entries of J_xi, column by column
     by_entry = ca.jacobian(rho, ca.vec(J))
     outputs = [by_entry[list(loss.smooth_rows[j]), j::r] for j in range(r)]
     for row in loss.hinge_rows:
@@ -327,7 +327,7 @@ class LossByArrays:
                     result[...] = 0.0
             else:
                 written([arguments[0], *(arguments[1 + k] for k in self._places)], results)
-            # then the terms of arrays
+            # Then the terms of arrays
             block = SampleBlock(self._loss, arguments[0], arguments[1:])
             slopes = np.zeros(block.units.rows.shape)
             for weight, term in self._loss.array_terms:

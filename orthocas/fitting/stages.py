@@ -152,26 +152,26 @@ class Continuation:
         self.space, self.r = JointSpace.of(problem).restricted_to(active), len(active) - problem.m
         self._stages: list[Stage] = []
         self._reached: tuple[Parametrisation, Family] | None = None
-        # what is built once: families by label, gradients of bases, spectral starts by number of samples and mirror
+        # What is built once: families by label, gradients of bases, spectral starts by number of samples and mirror
         self._families: dict[str, Family] = {}
         self._bases: dict[LinearFamily, BasisGradients] = {}
         self._starts: dict[tuple[LinearFamily, int, bool], Array] = {}
 
     def run(self) -> Solution:
         """Run all stages. After Ctrl-C, the last one is marked as interrupted."""
-        # degree by degree, if the family has degrees
+        # Degree by degree, if the family has degrees
         target, folds = self.settings.parametrisation, self.folds
         steps: list[Parametrisation] = [target]
         if isinstance(target, GradedParametrisation):
             self._require_memory(target)
             steps = [target.of_degree(degree) for degree in range(min(target.degree, 2), target.degree + 1)]
         last, before = steps[-1], -np.inf
-        # the best round: its conditioning, number of stages up to it, and worst points
+        # The best round: its conditioning, number of stages up to it, and worst points
         best: tuple[float, int, WorstPoints | None] = (-np.inf, 0, None)
         try:
             for step in steps:
                 self._solve(step, step.label, final=step is last)
-            # the last one again, until there is no point of small conditioning, or its conditioning no longer grows
+            # The last one again, until there is no point of small conditioning, or its conditioning no longer grows
             for k in range(2, 2 + RULES.rounds):
                 unfolded = folds.least >= LOSS_RULES.least_conditioning
                 settled = 0 <= folds.least < before + RULES.least_gain
@@ -181,10 +181,10 @@ class Continuation:
                     best = folds.least, len(self._stages), folds.worst
                 before = folds.least
                 self._solve(last, f"{last.label}, round {k}", final=True)
-            # new points may bring back folds that an earlier round had left behind
+            # New points may bring back folds that an earlier round had left behind
             if folds.least < min(best[0], 0):
                 self._stages, folds.worst = self._stages[: best[1]], best[2]
-            # the domain forces folds: their term would only spoil the rest
+            # The domain forces folds: their term would only spoil the rest
             if folds.least < 0 and folds.singular:
                 folds.give_up()
                 self._solve(last, f"{last.label}, with folds", final=True)
@@ -206,32 +206,32 @@ class Continuation:
         # Only the last degree is solved exactly, but in another metric than the identity: the loss has long valleys
         # there, and steps of low degrees cost little.
         solver = settings.solver if final or not problem.metric.is_identity else settings.solver.coarser()
-        # samples: half of them where a mirror symmetry halves the coefficients
+        # Samples: half of them where a mirror symmetry halves the coefficients
         mirror = self.mirror
         kept = mirror.kept(family) if isinstance(family, LinearFamily) and mirror is not None else None
         count = self._count_samples(family, kept)
         self.monitor(Progress(label, 0.0, f"sampling {count} points"))
-        # graphs of other families are few large products: they need the threads of BLAS more than the last digits
+        # Graphs of other families are few large products: they need the threads of BLAS more than the last digits
         with one_blas_thread() if isinstance(family, LinearFamily | ArrayFamily) else nullcontext():
             samples = self._sample(count, (settings.seed, 1 + degree))
             # CasADi may swallow Ctrl-C while graphs are built
             with deferred():
                 objective, start = self._build_objective(label, family, samples, None if kept is None else mirror)
             result = solver.minimise(objective, start, Watch(self.monitor, label))
-        # a bound on mutual angles has to be met in the end only
+        # A bound on mutual angles has to be met in the end only
         if isinstance(objective, BoundedMutual) and not np.isfinite(result.value):
             if final:
                 assert settings.max_mutual is not None
                 raise objective.explain_missed_bound(label, settings.max_mutual, result)
         else:
             result.raise_if_failed()
-        # back from the free components to all coefficients
+        # Back from the free components to all coefficients
         if kept is not None and mirror is not None:
             result = replace(result, theta=mirror.coordinates(expand(result.theta, kept)))
         stage = Stage(label, family.size, len(samples), result)
         self._stages.append(stage)
         self._reached = step, family
-        # the worst points of low degrees differ from those of the last one
+        # The worst points of low degrees differ from those of the last one
         if result.status is Status.INTERRUPTED:
             raise KeyboardInterrupt
         if final or degree >= RULES.searched:
@@ -242,17 +242,17 @@ class Continuation:
     ) -> tuple[Objective, Array]:
         """The loss of a family on samples, and the start in the parameters that it leaves free."""
         theta, settings = self._embed_last(family), self.settings
-        # linear families: least squares in their coefficients
+        # Linear families: least squares in their coefficients
         if isinstance(family, LinearFamily):
             objective, start = self._build_in_basis(family, samples, theta, mirror)
             if settings.max_mutual is None:
                 return self.folds.add_to(objective), start
             return bound_mutual_angles(objective, start, settings.max_mutual, self.problem.r, fresh=theta is None)
-        # all others: networks by arrays, anything else by CasADi's graphs
+        # All others: networks by arrays, anything else by CasADi's graphs
         if settings.max_mutual is not None:
             expected = "a parametrisation linear in its parameters, such as polynomial"
             raise InvalidValueError("max_mutual_deg", f"given with {label}", expected)
-        # with the state of the solver
+        # With the state of the solver
         numbers = 60 * family.size + 100 * len(samples) * self.space.n
         require_memory(f"{label} with {family.size} parameters", 8.0 * numbers)
         start, single = family.initial(settings.seed) if theta is None else theta, settings.precision == "single"
@@ -272,7 +272,7 @@ class Continuation:
                 return None
             assert isinstance(family, ProductFamily)
             return self.begin(family)
-        # a basis of higher degree contains the last one
+        # A basis of higher degree contains the last one
         theta, before = self._stages[-1].result.theta, self._reached[1]
         if theta.size == family.size:
             return theta
@@ -287,14 +287,14 @@ class Continuation:
         kept = None if mirror is None else mirror.kept(family)
         key = family, len(samples), kept is not None
         if theta is None and key not in self._starts:
-            # it does not depend on the seed: eigenvalues are close, so other samples would mix coordinates
+            # It does not depend on the seed: eigenvalues are close, so other samples would mix coordinates
             even = self._sample(len(samples), RULES.start_seed)
             start = find_spectral_start(family, even, kept, self._gradients(family))
-            # quantities to follow choose among coordinates of equal loss
+            # Quantities to follow choose among coordinates of equal loss
             if self.like is not None:
                 start = self.like.turn(family, start, even, self._gradients(family))
             self._starts[key] = start
-        # the start as components, which a mirror leaves even or odd, and of these the free ones
+        # The start as components, which a mirror leaves even or odd, and of these the free ones
         if theta is None:
             theta = self._starts[key]
         elif mirror is not None:
@@ -344,7 +344,7 @@ class Continuation:
         n, r, half = self.space.n, self.r, 1 if self.mirror is None else 2
         K = target.term_count(n)
         N = self._count_for_basis(K, r) / half
-        # numbers of the basis at a sample, see `BasisGradients`; they are there twice while they are built
+        # Numbers of the basis at a sample, see `BasisGradients`; they are there twice while they are built
         of_a_joint = K - target.term_count(n - 1) if n > 1 else K
         numbers = 1 + K if isinstance(target, Polynomial | Fourier) else n * of_a_joint
         gradients = 2 * (4 if self.settings.precision == "single" else 8) * numbers + 4 * n * K / OBJECTIVE_RULES.stride
@@ -417,7 +417,7 @@ class FoldSearch:
         fitted = problem.r - len(idle)
         space = JointSpace.of(problem)
         coordinates = Coordinates(parametrisation, space, idle, stage.result.theta, np.zeros(fitted), np.ones(fitted))
-        # points join before they fold, so that the next stage sees them
+        # Points join before they fold, so that the next stage sees them
         self.worst = worst_points(problem, coordinates, seed)
         self._points = np.concatenate([self._points, self.worst.below(RULES.collected)])
 
@@ -463,7 +463,7 @@ class FitSettings:
         Raises:
             InvalidValueError, ShapeError: if a setting is invalid, or contradicts another one.
         """
-        # the family, for this problem
+        # The family, for this problem
         require_kind("problem", problem, Problem)
         if parametrisation is None:
             parametrisation = choose_parametrisation(problem, bounded=max_mutual_deg is not None)
@@ -471,7 +471,7 @@ class FitSettings:
         bound = parametrisation.for_problem(problem)
         if max_mutual_deg is not None:
             max_mutual_deg = _check_bound(bound, max_mutual_deg)
-        # the solver; only Ipopt knows bounds
+        # The solver; only Ipopt knows bounds
         if solver is None:
             solver = choose_solver(bound, problem) if max_mutual_deg is None else Ipopt()
         if not isinstance(solver, Solver) or isinstance(solver, type):

@@ -56,33 +56,33 @@ def find_spectral_start(
     Source:
         ours, docs/explanation/derivations_fits.md#spectral-start.
     """
-    # the pencil: S is the mean square along the task, T the mean square of the gradient, both in the metric
+    # The pencil: S is the mean square along the task, T the mean square of the gradient, both in the metric
     basis = build_gradients(family, samples.points.shape[1]) if gradients is None else gradients
     G = basis.expand(basis.at(samples.points), len(samples)).astype(np.float64, copy=False)  # (N, n, K)
     N, _, K = G.shape
-    # components e_i^T d psi along the task gradients
+    # Components e_i^T d psi along the task gradients
     along_task = (samples.task_basis @ G).reshape(-1, K)
     S = along_task.T @ along_task / N
     raised = G if samples.metric_inverse is None else samples.metric_inverse @ G
     T = G.reshape(-1, K).T @ raised.reshape(-1, K) / N
     T += RULES.ridge * np.trace(T) / K * np.eye(K)
     middle = G.mean(axis=0)
-    # variance of the gradients
+    # Variance of the gradients
     V = G.reshape(-1, K).T @ G.reshape(-1, K) / N - middle.T @ middle
     allowed = np.ones((family.outputs, K), dtype=bool) if kept is None else kept
     C, left = np.zeros(allowed.shape), list(range(family.outputs))
     while left:
-        # one coordinate for all that allow the same coefficients
+        # One coordinate for all that allow the same coefficients
         classes = {allowed[j].tobytes(): j for j in reversed(left)}.values()
         j, c = min(((j, _find_smallest(S, T, V, allowed[j])) for j in classes), key=lambda pair: pair[1] @ S @ pair[1])
         left.remove(j)
         C[j] = c
-        # functions of this coordinate cost as much as what lies along the task
+        # Functions of this coordinate cost as much as what lies along the task
         gradient = raised @ c  # (N, n)
         length = np.sqrt(np.maximum(np.einsum("sn,sn->s", gradient, G @ c), 1e-300))
         along = np.einsum("sn,snk->sk", gradient / length[:, None], G)
         S = S + RULES.mutual_weight * along.T @ along / N
-    # coordinates have a mean gradient length of 1. The spectral solution inherits the symmetries of the problem, and a
+    # Coordinates have a mean gradient length of 1. The spectral solution inherits the symmetries of the problem, and a
     # symmetric point is often a saddle of the loss: neighbours that allow the same coefficients are mixed slightly
     C = C / np.linalg.norm(G @ C.T, axis=1).mean(axis=0)[:, None]
     cos, sin = np.cos(RULES.mixing_angle), np.sin(RULES.mixing_angle)
@@ -94,7 +94,7 @@ def find_spectral_start(
 def _find_smallest(S: Array, T: Array, V: Array, free: NDArray[np.bool_]) -> Array:
     """The c with c^T T c = 1 and the smallest c^T S c, zero where it is not free, (K,). Of exact ones that of V."""
     block = np.ix_(free, free)
-    # whitening W with W^T T W = I
+    # Whitening W with W^T T W = I
     whitening = np.linalg.inv(np.linalg.cholesky(T[block])).T
     values, vectors = np.linalg.eigh(whitening.T @ S[block] @ whitening)
     equal = whitening @ vectors[:, : max(1, np.count_nonzero(values < RULES.exact))]
@@ -151,7 +151,7 @@ class Mirror:
                 np.array(basis(self.space.centre[:, None] + self.space.half_width[:, None] * side))
                 for side in (u, self.signs[:, None] * u)
             )
-            # each function is even, odd, or neither
+            # Each function is even, odd, or neither
             size = np.abs(here).max(axis=1)
             even, odd = (np.abs(there - sign * here).max(axis=1) <= RULES.tolerance * size for sign in (1, -1))
             allowed: NDArray[np.bool_] = np.where(even, 1, -1) == self.parities[:, None]
@@ -169,11 +169,11 @@ def find_mirror(problem: Problem, active: list[int]) -> Mirror | None:
     space = JointSpace.of(problem).restricted_to(active)
     if space.n > RULES.most_joints:
         return None
-    # one point excludes most choices of signs, the others the rest
+    # One point excludes most choices of signs, the others the rest
     u = np.random.default_rng(RULES.seed).uniform(-1.0, 1.0, (RULES.points, space.n))
     left = [np.array(signs) for signs in product((1.0, -1.0), repeat=space.n)][1:]
     for points in (u[:1], u[1:]):
-        # task directions and metric at S u must be the mirror images of those at u
+        # Task directions and metric at S u must be the mirror images of those at u
         tensors = _evaluate_tensors(problem, active, np.concatenate([points, *(signs * points for signs in left)]))
         here, *there = tensors.reshape(1 + len(left), len(points), *tensors.shape[1:])
         left = [
@@ -200,13 +200,13 @@ def _find_parities(problem: Problem, active: list[int], signs: Array, u: Array) 
     The null space of J_x is mapped to itself where S q = q, and trace(S) on it is the number of even coordinates less
     that of odd ones.
     """
-    # on the mirror itself, S maps the null space to itself, and its trace counts parities
+    # On the mirror itself, S maps the null space to itself, and its trace counts parities
     tensors = _evaluate_tensors(problem, active, np.where(signs > 0, u, 0.0))
     inverse, projector = tensors[:, 0], tensors[:, 1]
     along_task = np.einsum("sii,i->s", np.linalg.solve(inverse, projector.transpose(0, 2, 1)), signs)
     differences = signs.sum() - along_task
     r = len(active) - problem.m
-    # a whole number of even coordinates, the same everywhere
+    # A whole number of even coordinates, the same everywhere
     even = np.round((r + differences.mean()) / 2)
     if np.abs(2 * even - r - differences).max() > 0.01 or not 0 <= even <= r:
         return None

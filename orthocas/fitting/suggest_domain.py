@@ -119,7 +119,7 @@ def suggest_domain(
     bounds, loss = Bounds(float(leak_deg), float(conditioning)), Weights.of(weights)
     if parametrisation is not None:
         require_parametrisation(parametrisation)
-    # the problem around the home, and the joints whose half-widths are searched
+    # The problem around the home, and the joints whose half-widths are searched
     posture = find_home(robot, task, home)
     room = np.minimum(_measure_room(robot, posture.q), _bound_widths(robot))
     problem = Problem(robot, task, metric, Box(posture.q, np.minimum(_propose_widths(robot), room)))
@@ -127,7 +127,7 @@ def suggest_domain(
     joints = _Joints.of(problem)
     prober = Prober(problem, joints.active, joints.cyclic, loss)
     stricter = replace(bounds, conditioning=min(1.0, RULES.margin * bounds.conditioning))
-    # the widest box for trial charts, then a fit that confirms it
+    # The widest box for trial charts, then a fit that confirms it
     widths, broken = WidestBox(prober, posture.q, room, joints.free, stricter, monitor).search(_propose_widths(robot))
     family = choose_parametrisation(problem, bounded=True) if parametrisation is None else parametrisation
     fit, quality = _confirm(prober, family, joints, widths, bounds, seed, monitor)
@@ -177,7 +177,7 @@ class _Joints:
         robot, domain = problem.robot, problem.domain
         limited = _measure_room(robot, domain.centre) <= _bound_widths(robot)
         widths = []
-        # the first that applies, of whole ranges, bounds and limits
+        # The first that applies, of whole ranges, bounds and limits
         for k, name in enumerate(self.names):
             reason: Reason = "joint limit" if limited[k] else "unlimited"
             if broken.get(k):
@@ -244,13 +244,13 @@ class WidestBox:
         """
         if not self.free:
             return self.room.copy(), {}
-        # fractions of the search, for the monitor: the first scale, then each round of exchange, then growth
+        # Fractions of the search, for the monitor: the first scale, then each round of exchange, then growth
         count, rounds = len(self.free), max(1, RULES.exchanged // len(self.free))
         times = [RULES.first_time, *[count + RULES.next_time] * rounds]
         ends = np.cumsum(times) / (sum(times) + RULES.growth_time * count)
         self._next = ends[0], RULES.trials
         widths, exchange, step = self._scale_to_boundary(unit, RULES.start), None, 1.0
-        # rounds of exchange: wider where joints cost little, narrower where they cost much
+        # Rounds of exchange: wider where joints cost little, narrower where they cost much
         for end in ends[1:]:
             self._next = end, count + RULES.trials
             exchange = self._compute_exchange(widths) if exchange is None else exchange
@@ -258,7 +258,7 @@ class WidestBox:
             if np.log(trial[self.free]).sum() > np.log(widths[self.free]).sum():
                 widths, exchange = trial, None
                 continue
-            # the box got smaller: try half of the exchange
+            # The box got smaller: try half of the exchange
             step /= 2
             if step < RULES.least_step:
                 break
@@ -300,7 +300,7 @@ class WidestBox:
             else:
                 high = scale
             if high < RULES.smallest:
-                # which bound breaks even on a box of these half-widths (n,), and what may help
+                # Which bound breaks even on a box of these half-widths (n,), and what may help
                 quality = self.evaluate(widths)
                 miss = next(iter(quality.excess(self.bounds)))
                 raise DomainError(
@@ -326,13 +326,13 @@ class WidestBox:
     def _grow(self, widths: Array) -> tuple[Array, dict[int, list[Miss]]]:
         """Widen each joint alone while the bounds are kept, and say what breaks then. Its first step may need a fit."""
         broken: dict[int, list[Miss]] = {k: [] for k in self.free}
-        # joint after joint, in steps that grow while the bounds are kept, and begin small again where they are not
+        # Joint after joint, in steps that grow while the bounds are kept, and begin small again where they are not
         begin = self._fraction
         for done, k in enumerate(self.free, 1):
             self._next = begin + (1 - begin) * done / len(self.free), 2
             before, factor = widths[k], RULES.wider
             while widths[k] < self.room[k]:
-                # the first step too many says what breaks
+                # The first step too many says what breaks
                 wider = self._widen(widths, k, factor)
                 ratios = self.evaluate(wider, self.bounds, leap=widths[k] > before).excess(self.bounds)
                 misses = [name for name, ratio in ratios.items() if ratio > 1]
@@ -367,7 +367,7 @@ def _confirm(
     for shrinkings in range(RULES.tries):
         box = Box(problem.domain.centre, widths * factors**shrinkings, unbounded)
         trial = Problem(robot, problem.task, problem.metric, box, problem.name)
-        # a fit would take ten times as long to find that
+        # A fit would take ten times as long to find that
         # descents see what samples miss
         if not prober.least(trial, seed + 1) >= enough:
             continue

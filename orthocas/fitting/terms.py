@@ -148,11 +148,11 @@ class CosineTerm:
         directions, scale = self._list_directions(units, data)
         cosines = units.rows @ directions.transpose(0, 2, 1)  # (N, r, k)
         if not self.toward:
-            # no gradient is a pair with itself
+            # No gradient is a pair with itself
             np.einsum("sjj->sj", cosines)[...] = 0.0
         squares = np.einsum("sja,sja->s", cosines, cosines)
         cosines *= scale
-        # each pair is there twice
+        # Each pair is there twice
         return squares * (scale / (2 if self.toward else 4)), cosines @ directions
 
     def build_curvatures(self, units: UnitGradients, data: Mapping[str, Array]) -> Iterator[Array]:
@@ -377,7 +377,7 @@ def volume_hinges(units: UnitGradients, null_basis: Array, bound: float) -> tupl
     D = units.rows @ null_basis
     volume = np.linalg.det(D)
     hinges, cofactors = np.maximum(bound - volume, 0.0), np.zeros(D.shape)
-    # only where the hinge acts
+    # Only where the hinge acts
     active = np.flatnonzero(hinges > 0)
     cofactors[active] = -_cofactors(D[active], volume[active])
     return hinges, cofactors @ null_basis.transpose(0, 2, 1)
@@ -419,7 +419,7 @@ class RegularityTerm:
         """One residual, (1, 1)."""
         Z, metric_inverse = data["null_basis"], data.get("metric_inverse")
         if self.euclidean and metric_inverse is not None:
-            # a basis with the volume of an orthonormal one
+            # A basis with the volume of an orthonormal one
             columns = [Z[:, 0] / ca.sqrt(compute_determinant(Z.T @ Z)), *(Z[:, k] for k in range(1, sizes.r))]
             Z, metric_inverse = ca.horzcat(*columns), None
         hinge: ca.SX = ca.fmax(self.bound_for(sizes.r) - gradient_volume(coordinate_jacobian, Z, metric_inverse), 0)
@@ -508,7 +508,7 @@ def find_term(name: str) -> LossTerm:
 
 for _term in (
     *(TaskTerm(), MutualTerm(), MetricTaskTerm(), MetricMutualTerm(), LengthTerm(), RegularityTerm(), FOLD_TERM),
-    # of wide fits
+    # Of wide fits
     RegularityTerm("volume", RULES.wide_volume),
     RegularityTerm("volume with the worst", RULES.worst_volume),
     RegularityTerm("euclidean volume", RULES.beyond * RULES.least_in_metric, euclidean=True),

@@ -196,7 +196,7 @@ def fit_wide(
     require_kind("collisions", collisions, bool)
     solids = robot.collisions if collisions else None
 
-    # positions of the branch that count for its share, and the posture at which xi has the value of its quantity
+    # Positions of the branch that count for its share, and the posture at which xi has the value of its quantity
     chosen = _choose_branch(robot, task, branch, home)
     posture = chosen.posture if home is None else find_home(robot, task, home).q
     counted = sample_nonsingular(robot, task, chosen.box, RULES.held_out, (seed, RULES.counted_tag))
@@ -210,7 +210,7 @@ def fit_wide(
         solution = _solve_at_once(problem, quantities, parametrisation, wanted, counted, seed)
         if solution is not None:
             return finish(solution, settings=settings, interrupted=pressed())
-        # families to try; the domain of each covers all positions of its cyclic joints
+        # Families to try; the domain of each covers all positions of its cyclic joints
         families = _choose_families(problem, like) if parametrisation is None else (parametrisation,)
         searches = [Search(*_prepare(problem, family, like), settings) for family in families]
         try:
@@ -270,7 +270,7 @@ def _build_problems(
         return (build(box),)
     except DomainError:
         points, values = sample_centres(robot, task, box)
-    # of the clear positions, the one with the most room around it
+    # Of the clear positions, the one with the most room around it
     clear = points[values > BRANCH_RULES.of_centre * clearance]
     room = box.half_width - np.abs(clear - box.centre)
     if not len(clear):
@@ -280,7 +280,7 @@ def _build_problems(
     best = int(np.argmax(np.log(room).sum(axis=1)))
     home, half_width, centre = clear[best], room[best], box.centre.copy()
     smaller = build(Box(home, half_width, box.unbounded))
-    # a smaller box leaves nothing out of joints without limits; these have their turn around the home
+    # A smaller box leaves nothing out of joints without limits; these have their turn around the home
     if {*np.flatnonzero(half_width < box.half_width)} <= {*box.unbounded}:
         return (smaller,)
     centre[list(box.unbounded)] = home[list(box.unbounded)]
@@ -311,7 +311,7 @@ def _choose_families(problem: Problem, like: Likeness | None) -> tuple[Polynomia
     Then a network, but not for coordinates that are to mean something, nor with slides without limits.
     """
     robot = problem.robot
-    # joints that may enter linearly, and those of them that must, since they have no ends
+    # Joints that may enter linearly, and those of them that must, since they have no ends
     free = [k for k in range(robot.n) if keeps_self_motions(problem, k)]
     slides = robot.tree.prismatic
     endless = [k for k in free if slides[k] and np.isinf(robot.lower[k]) and np.isinf(robot.upper[k])]
@@ -326,7 +326,7 @@ def _choose_families(problem: Problem, like: Likeness | None) -> tuple[Polynomia
         if len(linear) + len(without) >= robot.n - problem.r:
             continue
         if like is None and problem.r == 1:
-            # a joint with limits enters a network like others: linear in it, coordinates lean by up to 13 degrees more
+            # A joint with limits enters a network like others: linear in it, coordinates lean by up to 13 degrees more
             unlimited = tuple(name for name in linear if np.isinf(robot.upper[robot.joint_names.index(name)]))
             families.append(replace(RULES.small_network, cyclic=unlimited, without=without))
         else:
@@ -344,7 +344,7 @@ def _prepare(problem: Problem, family: Parametrisation, like: Likeness | None) -
     require_parametrisation(family)
     family = family.for_problem(problem)
     if isinstance(family, CyclicParametrisation):
-        # a family that does without joints that turn tool or base is regular at any turn of them, or at none
+        # A family that does without joints that turn tool or base is regular at any turn of them, or at none
         names, task = problem.robot.joint_names, problem.task
         left_out = ((name, names.index(name)) for name in list_left_out(family) if name in names)
         free = (name for name, k in left_out if turns_tool(task, k) or keeps_self_motions(problem, k))
@@ -399,7 +399,7 @@ def _finish(
         wrong = f"in the middle of branch '{branch.name}', coordinates fold or have another sign than on most of it"
         raise DomainError(f"{wrong}: give a smaller box as branch, another branch, or another parametrisation")
     coordinates, quantities, meaning = _name_coordinates(solution, settings, posture)
-    # the domain is where coordinates are regular; how much of the branch that is, and how good they are there
+    # The domain is where coordinates are regular; how much of the branch that is, and how good they are there
     domain = RegularPart(clear.domain, coordinates, find_least_volume(clear))
     problem = Problem(clear.robot, clear.task, clear.metric, domain, clear.name)
     share = float(domain.contains(counted).mean()) if len(counted) else float("nan")

@@ -105,7 +105,7 @@ _ADAM = Adam(epochs=8, steps=500, batch=512, learning_rate=1e-2)
 # Adam once the worst of fresh samples have joined
 _SLOWER = replace(_ADAM, learning_rate=5e-3)
 _SLOWER_OF_SMALL = replace(_SLOWER, epochs=5)
-# the names of first stages begin with it
+# The names of first stages begin with it
 _STAGE = "whole branch"
 
 
@@ -144,14 +144,14 @@ def search_families(searches: Sequence["Search"]) -> "Search":
     for search in symmetric:
         search.begin(f"{_STAGE}, {search.parametrisation.label}")
         most = RULES.poor_without_turns if len(search.left_out) > 1 else RULES.poor_without_tool
-        # rounds with the worst samples divide the fraction of bad positions by two to four, by two without the base
+        # Rounds with the worst samples divide the fraction of bad positions by two to four, by two without the base
         if search.is_enough(4 / len(search.left_out) * most):
             search.go_on()
         if search.is_enough(most) or len(searches) == 1:
             return search
         hopeless = search.rank[1] > RULES.hopeless
     first, *others = searches[len(symmetric) :]
-    # what is linear in base and tool is as bad then
+    # What is linear in base and tool is as bad then
     if not hopeless or all(search.linear for search in others):
         first.begin(_STAGE)
     missed, bad, _ = first.rank
@@ -213,7 +213,7 @@ class Search:
         self._alignment = RULES.alignment if problem.metric.is_identity else RULES.alignment_in_metric
         self._objectives: list[BasisObjective] = []
         self._sign = 1.0  # of the volumes
-        # done: coordinates are as regular as they need to be; finished: all rounds have been made
+        # Done: coordinates are as regular as they need to be; finished: all rounds have been made
         self._done = self._finished = False
 
     def begin(self, name: str) -> None:
@@ -225,7 +225,7 @@ class Search:
             self._sign = 1.0 if self._evaluate_volumes(self._last, self._centre)[0] > 0 else -1.0
             self._descend(name, "volume", self.solver)
         else:
-            # samples near the centre, whose sign decides which part of the domain is kept
+            # Samples near the centre, whose sign decides which part of the domain is kept
             problem, domain, count = self.problem, self.problem.domain, max(2, int(RULES.near * self.samples))
             seed = self.settings.seed, RULES.tag, RULES.centre_tag
             near = sample_uniform(Box(domain.home, RULES.near * domain.half_width), count, seed)
@@ -233,7 +233,7 @@ class Search:
             if problem.metric.is_identity or problem.r > 1 or self.left_out:
                 self._last = self._start_at_random()
             else:
-                # networks of all joints are led by those of A = I: from a random start, some would stay folded
+                # Networks of all joints are led by those of A = I: from a random start, some would stay folded
                 plain = Problem(problem.robot, problem.task, "euclidean", problem.domain, problem.name)
                 leader = Search(plain, self.parametrisation, self.settings)
                 leader.begin(f"{name}, A = I")
@@ -313,24 +313,24 @@ class Search:
         """
         problem, some = self.problem, self._samples[0][:: RULES.every]
         X = self._basis.at(some.points)
-        # mean of dpsi_i/dq A^-1 dpsi_j/dq, (K, K)
+        # Mean of dpsi_i/dq A^-1 dpsi_j/dq, (K, K)
         inverse = np.eye(problem.n)[None] if some.metric_inverse is None else some.metric_inverse
         root = np.broadcast_to(np.linalg.cholesky(inverse), (len(some), problem.n, problem.n))
         parts = (self._basis.differentiate_along(X, root[:, :, i]) for i in range(problem.n))
         energy = sum((G.T @ G for G in parts), start=np.zeros(())) / len(some)
         self._factor = np.linalg.cholesky(energy + RULES.ridge * np.trace(energy) / len(energy) * np.eye(len(energy)))
-        # directions across the task at the centre; quantities to follow turn them
+        # Directions across the task at the centre; quantities to follow turn them
         directions = scipy.linalg.null_space(self._centre.task_jacobian[0]).T
         quantities, self._likeness = self.settings.quantities, list[QuadraticTerm]()
         if quantities is not None:
             directions = quantities.choose_directions(some, self._centre)
             self._likeness = quantities.hold(some, lambda a: self._basis.differentiate_along(X, a))
-        # the combination of functions whose gradients are nearest to them in the mean
+        # The combination of functions whose gradients are nearest to them in the mean
         sides = [
             self._basis.differentiate_along(X, np.broadcast_to(a, some.points.shape)).mean(axis=0) for a in directions
         ]
         C = scipy.linalg.cho_solve((self._factor, True), np.array(sides).T).T
-        # gradients of those that follow quantities are as long as theirs
+        # Gradients of those that follow quantities are as long as theirs
         for k, (E, _, a) in enumerate(self._likeness):
             C[k] *= np.sqrt(a / (C[k] @ E @ C[k]))
         return np.asarray(C.ravel())
@@ -347,7 +347,7 @@ class Search:
     def _add_worst(self, fresh: int, worst: int, tag: int) -> None:
         """Let those of fresh samples join at which the last coordinates have the least volumes."""
         points = self.sample(fresh, tag)
-        # matrices of all would take a gigabyte
+        # Matrices of all would take a gigabyte
         parts = np.array_split(points, -(-fresh // RULES.held_out))
         frames = (sample_plain_frames(self.problem, part) for part in parts)
         volumes = np.concatenate([self._sign * self._evaluate_volumes(self._last, part) for part in frames])
@@ -385,14 +385,14 @@ class Search:
         """Weights of all terms: those of the angles are ours, unless the user gives `Weights`."""
         own, users = self._weigh_regularity(volume), self.settings.weights
         if not isinstance(users, Weights):
-            # coordinates that follow quantities have the angles between these
+            # Coordinates that follow quantities have the angles between these
             mutual = RULES.mutual if self.settings.quantities is None else 0.0
             angles = 2 * self.problem.m * self._alignment, 2 * mutual
             users = Weights(*angles, 0.0, 0.0, 0.0, dict(users or {}), "metric")
         users = replace(users, folds=0.0, extra={**own, **users.extra}).for_problem(self.problem)
         if self.problem.r > 1 or users.angles == "paper":
             return users
-        # the same leak by the self-motion, which is a single one
+        # The same leak by the self-motion, which is a single one
         return replace(users, task=0.0, extra={**users.extra, "self-motion": users.task / self.problem.m})
 
     def _build_in_basis(self, volume: str) -> "Orthonormal":
@@ -402,14 +402,14 @@ class Search:
         """
         weights = self._choose_weights(volume)
         assert isinstance(self.family, LinearFamily)
-        # the mean loss over all samples: first ones and worst ones by their number
+        # The mean loss over all samples: first ones and worst ones by their number
         lengths = np.linalg.norm(self._last.reshape(self.problem.r, -1) @ self._factor, axis=1)
         if self._objectives:
             self._objectives[0] = self._objectives[0].reweigh(weights)
         else:
             common = self.family, self._samples[0], weights, self._last, self._draw
             self._objectives.append(BasisObjective(*common, gradients=self._basis, orientation=self._sign))
-        # those of the worst samples that joined since
+        # Those of the worst samples that joined since
         for samples in self._samples[len(self._objectives) :]:
             self._objectives.append(self._objectives[0].elsewhere(samples, self._weigh_regularity(volume)))
         count = sum(len(samples) for samples in self._samples)
@@ -441,7 +441,7 @@ class Search:
         """Take the result of a stage, keep its parameters if they are the best so far, and return its rank."""
         theta, bound = result.theta, find_least_volume(self.problem)
         self.stages.append(Stage(name, theta.size, samples, result))
-        # regular at the centre, and at all but few of other samples
+        # Regular at the centre, and at all but few of other samples
         at_centre, volumes = (
             self._sign * self._evaluate_volumes(theta, samples) for samples in (self._centre, self._held_out)
         )
@@ -466,7 +466,7 @@ class Search:
         return np.asarray(np.linalg.det(unit @ samples.null_basis))
 
     @cached_property
-    # built when this family is tried, and not before
+    # Built when this family is tried, and not before
     def _basis(self) -> BasisGradients:
         assert isinstance(self.family, LinearFamily)
         return build_gradients(self.family, self.problem.n)
@@ -568,7 +568,7 @@ class Orthonormal:
         """The loss and its derivative, (size,)."""
         value, slopes = self.loss.value_and_gradient(self._coefficients(variables).ravel())
         columns = slopes.reshape(len(self.lengths), -1).T
-        # numbers that are not finite are for the solver to report
+        # Numbers that are not finite are for the solver to report
         solved = scipy.linalg.solve_triangular(self.factor, columns, lower=True, check_finite=False)
         return value, np.asarray(solved).T.ravel()
 
