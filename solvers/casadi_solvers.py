@@ -116,7 +116,14 @@ class _IpoptRun:
             jacobian = self._node("jac_g", [self.size], [(rows, 1), (rows, self.size)], self._constraints)
             problem["g"] = constraints(x)
             options["jac_g"] = ca.Function("nlp_jac_g", [x, p], list(jacobian(x)))
-        options |= self._hessian_options(x, p)
+        # the exact Hessian of the Lagrangian if it is known and not too large
+        if (self.constrained or isinstance(self.objective, SmoothObjective)) and self.size <= RULES.exact_hessian:
+            lam_f, lam_g = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", rows)
+            node = self._node("hessian", [self.size, 1, rows], [(self.size, self.size)], self._hessian)
+            upper = ca.triu(node(x, lam_f, lam_g))
+            options["hess_lag"] = ca.Function("nlp_hess_l", [x, p, lam_f, lam_g], [upper])
+        else:
+            options |= {"ipopt.hessian_approximation": "limited-memory", "ipopt.limited_memory_max_history": 20}
         # Ipopt calls the watcher at the start and after every iteration; an error there stops it.
         lengths = {"x": self.size, "f": 1, "g": rows, "lam_x": self.size, "lam_g": rows}
         names = [ca.nlpsol_out(i) for i in range(ca.nlpsol_n_out())]
@@ -138,17 +145,6 @@ class _IpoptRun:
         }
         options |= {f"ipopt.{name}": value for name, value in settings.items()}
         return ca.nlpsol("ipopt", "ipopt", problem, options)
-
-    def _hessian_options(self, x: ca.MX, p: ca.MX) -> dict[str, Any]:
-        """An exact Hessian of the Lagrangian, or the limited-memory approximation."""
-        known = self.constrained or isinstance(self.objective, SmoothObjective)
-        if not known or self.size > RULES.exact_hessian:
-            return {"ipopt.hessian_approximation": "limited-memory", "ipopt.limited_memory_max_history": 20}
-        rows = len(self.constrained.bounds[0]) if self.constrained else 0
-        lam_f, lam_g = ca.MX.sym("lam_f"), ca.MX.sym("lam_g", rows)
-        node = self._node("hessian", [self.size, 1, rows], [(self.size, self.size)], self._hessian)
-        upper = ca.triu(node(x, lam_f, lam_g))
-        return {"hess_lag": ca.Function("nlp_hess_l", [x, p, lam_f, lam_g], [upper])}
 
     def _node(self, name: str, rows: list[int], shapes: list[tuple[int, int]], compute: Any) -> "ArrayNode":
         node = ArrayNode(name, rows, shapes, compute)

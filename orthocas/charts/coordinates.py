@@ -286,7 +286,7 @@ class Coordinates:
 
     def into(self, name: str, results: Array, points: Array) -> Array:
         """Write xi or the Jacobian at points (N, n) to `results`, which may be part of a larger array; return it."""
-        if not self._has_blocks or len(points) < (_FEW if self.as_matrices else MANY):
+        if len(points) < (_FEW if self.as_matrices else MANY) or self._on_blocks is None:
             self._point_by_point[name].into(results, points)
         else:
             with one_blas_thread():
@@ -325,17 +325,12 @@ class Coordinates:
         return BuiltOnUse(lambda name: BlockedFunction(fast(self.functions[name])))
 
     @cached_property
-    def _has_blocks(self) -> bool:
-        """Whether products of matrices make the family fast on blocks of joint positions."""
-        return self.as_matrices or (len(self.offset) > 0 and isinstance(self.family, SelfDerivativeFamily))
-
-    @cached_property
-    def _on_blocks(self) -> BuiltOnUse[str, Maker]:
-        """What makes functions of many joint positions side by side."""
+    def _on_blocks(self) -> BuiltOnUse[str, Maker] | None:
+        """Makers of xi and jacobian on blocks of joint positions; None if matrix products do not make them fast."""
         if self.as_matrices:
             return BuiltOnUse(lambda name: self._column_graphs[name].build_block_function)
-        family = self.family
-        assert isinstance(family, SelfDerivativeFamily)
+        if not len(self.offset) or not isinstance(family := self.family, SelfDerivativeFamily):
+            return None
         return BuiltOnUse(lambda name: (_values if name == "xi" else _slopes)(self, family))
 
     @cached_property

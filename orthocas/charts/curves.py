@@ -137,7 +137,21 @@ class SelfMotionCurves:
                 rows = np.flatnonzero(best.distance > 0)
                 if rows.size:
                     ends = ends.joined(self._search_from(targets, rows, starts[:, rows], own, traced, tolerance, best))
-            self._take_ends(targets, ends, best)
+            # halve between the point inside and the one outside, for ends of arcs that may be the nearest
+            useful = np.flatnonzero(ends.least < best.distance[ends.row])
+            rows, a, b = ends.row[useful], ends.inside[useful], ends.outside[useful]
+            # Far along a joint without boundaries, floats may be farther apart than the goal: the rounds are bounded.
+            for _ in range(RULES.narrowings):
+                if np.abs(b - a).max(initial=0.0) <= RULES.narrow:
+                    break
+                along, middle = b - a, (a + b) / 2
+                t = along / np.linalg.norm(along, axis=1, keepdims=True)
+                middle = middle + self.tracer.correct(targets[rows, : self.boxed.m], middle, t)[0]
+                middle = np.where(np.isfinite(middle), middle, b)
+                within = self._contains(middle)
+                a, b = np.where(within[:, None], middle, a), np.where(within[:, None], b, middle)
+            if rows.size:
+                best.take(rows, a, np.abs(self._xi_left(targets[rows], a)))
         return best
 
     def stages(self, targets: Array, own: Array) -> tuple[Array, Array]:
@@ -423,24 +437,6 @@ class SelfMotionCurves:
         """Which points (N, n) lie in the box of the domain."""
         low, high = self.boxed.domain.bounds
         return np.asarray(((q >= low) & (q <= high)).all(axis=1))
-
-    def _take_ends(self, targets: Array, ends: "Ends", best: Nearest) -> None:
-        """The ends of arcs, of rows in which they may be nearest: by halving what lies between inside and outside."""
-        useful = np.flatnonzero(ends.least < best.distance[ends.row])
-        rows, a, b = ends.row[useful], ends.inside[useful], ends.outside[useful]
-        if not rows.size:
-            return
-        # where a descent got lost on a joint without boundaries, the spacing of numbers is wider than that
-        for _ in range(RULES.narrowings):
-            if np.abs(b - a).max(initial=0.0) <= RULES.narrow:
-                break
-            along, middle = b - a, (a + b) / 2
-            t = along / np.linalg.norm(along, axis=1, keepdims=True)
-            middle = middle + self.tracer.correct(targets[rows, : self.boxed.m], middle, t)[0]
-            middle = np.where(np.isfinite(middle), middle, b)
-            within = self._contains(middle)
-            a, b = np.where(within[:, None], middle, a), np.where(within[:, None], b, middle)
-        best.take(rows, a, np.abs(self._xi_left(targets[rows], a)))
 
     def _xi_left(self, targets: Array, q: Array) -> Array:
         """xi - xi(q), (N,)."""

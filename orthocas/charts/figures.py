@@ -66,7 +66,8 @@ def self_motion_figure(chart: "Chart", postures: int = 9) -> Figure:
         moved = np.abs(chart.x(sweep) - chart.x(chart.problem.domain.home)).max()
         low, high = chart.xi(sweep[[0, -1]])[:, j]
         title = rf"$\xi_{{{j + 1}}}$ from {low:.3g} to {high:.3g}, dark to light"
-        panel.set_title(f"{title}\ntask moves {_bound(moved)}", fontsize=10)
+        power = int(np.ceil(np.log10(max(moved, 1e-16))))
+        panel.set_title(f"{title}\ntask moves < 1e{power:d} m", fontsize=10)
         equal_axes(panel, everything)
     return figure
 
@@ -83,10 +84,6 @@ def _draw_angles(axes: Axes, angles: "AngleStatistics", colour: str, label: str)
     axes.set_xlabel(f"{label} [deg]")
     axes.set_title(f"mean {angles.mean:.2f}°, std {angles.std:.2f}°", fontsize=10)
     axes.grid(alpha=0.3)
-
-
-def _bound(length: float) -> str:
-    return f"< 1e{int(np.ceil(np.log10(max(length, 1e-16)))):d} m"
 
 
 def _require(name: str, value: object, part: str, wanted: str) -> None:

@@ -169,11 +169,14 @@ class Inside:
 
     def _turned(self, targets: Array, points: "Points", q: Array) -> "Points":
         """Points after the full turns near those of q (N, n) that bring xi nearest to targets (N, n)."""
-        (turns, shifts), turn = self._turns, 2 * np.pi / self.boxed.domain.half_width
-        u = points.u - np.where(
-            turns.any(axis=0), turn * np.round((points.u - self.boxed.of_points(q)[points.row]) / turn), 0.0
-        )
-        away = np.linalg.norm(self.boxed.xi_gaps(targets[points.row], self.boxed.points(u))[:, None] - shifts, axis=2)
+        boxed = self.boxed
+        # choices of turns (T, n) of joints whose turn adds the same to xi at all positions, and what they add, (T, r)
+        winds, turn = boxed.winding & boxed.even, 2 * np.pi / boxed.domain.half_width
+        turns = np.array(list(product(*((-1.0, 0.0, 1.0) if joint else (0.0,) for joint in winds))))
+        shifts = turns @ np.where(winds[:, None], boxed.turned[0], 0.0)
+        # u within half a turn of that of q, then turned by the best choice
+        u = points.u - np.where(winds, turn * np.round((points.u - boxed.of_points(q)[points.row]) / turn), 0.0)
+        away = np.linalg.norm(boxed.xi_gaps(targets[points.row], boxed.points(u))[:, None] - shifts, axis=2)
         return Points(points.row, u + turn * turns[np.argmin(away, axis=1)], away.min(axis=1), points.error)
 
     def _slice(self, targets: Array, own: Array, rows: Indices) -> "Points":
@@ -243,13 +246,6 @@ class Inside:
         J = self.boxed.phi_map.jacobian(q)[:, : self.boxed.m] / self.boxed.phi_map.sizes[: self.boxed.m, None]
         reach = np.nanmean(np.linalg.norm(J, axis=1), axis=0) * self.boxed.domain.half_width
         return CurveTracer(self.boxed, tuple(int(j) for j in np.argsort(reach)[: q.shape[1] - self.boxed.m - 1]))
-
-    @cached_property
-    def _turns(self) -> tuple[Array, Array]:
-        """Choices of full turns of joints that add the same to xi everywhere, (T, n), and what they add, (T, r)."""
-        winds = self.boxed.winding & self.boxed.even
-        turns = np.array(list(product(*((-1.0, 0.0, 1.0) if joint else (0.0,) for joint in winds))))
-        return turns, turns @ np.where(winds[:, None], self.boxed.turned[0], 0.0)
 
 
 @dataclass(frozen=True, eq=False)

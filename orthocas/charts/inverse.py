@@ -440,7 +440,15 @@ class Inverse:
         if inside and self.inside is not None:
             own = best.q.copy() if starts is None else starts
             if self.curves is not None:
-                self._search_curves(self.curves, self.inside, targets, best, own, tolerance)
+                # r = 1: other solutions, or the nearest xi, on self-motion curves
+                rows = np.flatnonzero(best.status != InverseStatus.FOUND)
+                missing = self._take_nearest(self.curves, self.inside, targets, best, rows, own[rows], tolerance)
+                # again from points inside that have x; if the curves through these have none, the points themselves
+                q, in_reach = self.inside.with_task(targets[missing], best.q[missing])
+                again, own = missing[in_reach], q[in_reach]
+                left = self._take_nearest(self.curves, self.inside, targets, best, again, own, tolerance)
+                self._replace(targets, best, missing[~in_reach], q[~in_reach], tolerance)
+                self._replace(targets, best, left, own[np.isin(again, left)], tolerance)
             else:
                 # other solutions, or the nearest coordinates, inside the domain
                 rows = np.flatnonzero(best.status != InverseStatus.FOUND)
@@ -502,18 +510,6 @@ class Inverse:
             if not left.any():
                 break
             best.improve(rows[left], self._attempt(targets[rows[left]], start[left], tolerance))
-
-    def _search_curves(
-        self, curves: SelfMotionCurves, inside: Inside, targets: Array, best: Found, own: Array, tolerance: float
-    ) -> None:
-        """Replace what is not found by other solutions, or the nearest xi, on self-motion curves inside the domain."""
-        rows = np.flatnonzero(best.status != InverseStatus.FOUND)
-        missing = self._take_nearest(curves, inside, targets, best, rows, own[rows], tolerance)
-        q, in_reach = inside.with_task(targets[missing], best.q[missing])
-        again, own = missing[in_reach], q[in_reach]
-        left = self._take_nearest(curves, inside, targets, best, again, own, tolerance)
-        self._replace(targets, best, missing[~in_reach], q[~in_reach], tolerance)
-        self._replace(targets, best, left, own[np.isin(again, left)], tolerance)
 
     def _take_nearest(
         self,

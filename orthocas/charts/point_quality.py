@@ -289,6 +289,8 @@ def descended(value: Value, u: Array, found: Array, seed: int) -> tuple[Array, A
     rng = np.random.default_rng((seed, WORST.candidates))
     order = np.argsort(found)[: min(WORST.descents, int(np.isfinite(found).sum()))]
     u, found, step = u[order], found[order], np.full(len(order), WORST.first_step)
+    if not len(u):
+        return u, found
     # short descents of many
     for _ in range(WORST.steps):
         _step(value, u, found, step, rng)
@@ -299,8 +301,14 @@ def descended(value: Value, u: Array, found: Array, seed: int) -> tuple[Array, A
     before = [np.inf] * WORST.quiet_pairs
     for _ in range(WORST.most_pairs):
         _step(value, best, least, own, rng)
-        _exchange(value, best, least, rng)
-        before.append(least.min(initial=np.inf))
+        # differential evolution: each point steps towards one of the best, and along a difference of two others
+        K = len(best)
+        one, other = best[rng.integers(K, size=(2, K))]
+        leaders = best[rng.choice(np.argsort(least)[: max(1, int(WORST.leaders * K))], K)]
+        scale, share = rng.uniform(*WORST.scale, (K, 1)), rng.choice(WORST.exchanged, (K, 1))
+        moved = rng.uniform(size=best.shape) < share
+        _take_less(value, best, least, best + scale * (leaders - best + one - other) * moved)
+        before.append(least.min())
         if before[-1] > before[-1 - WORST.quiet_pairs] - WORST.gain:
             break
     u, found = np.vstack([u, best]), np.concatenate([found, least])
@@ -313,16 +321,6 @@ def _step(value: Value, u: Array, found: Array, step: Array, rng: np.random.Gene
     moves = rng.normal(size=u.shape) * (rng.uniform(size=u.shape) < WORST.moved)
     less = _take_less(value, u, found, u + step[:, None] * moves)
     step[:] = np.maximum(WORST.last_step, step * np.where(less, 1.5, 0.8))
-
-
-def _exchange(value: Value, u: Array, found: Array, rng: np.random.Generator) -> None:
-    """One step of differential evolution, in place: towards one of the best, and along a difference of two others."""
-    if not len(u):
-        return
-    one, other = u[rng.integers(len(u), size=(2, len(u)))]
-    best = u[rng.choice(np.argsort(found)[: max(1, int(WORST.leaders * len(u)))], len(u))]
-    scale, share = rng.uniform(*WORST.scale, (len(u), 1)), rng.choice(WORST.exchanged, (len(u), 1))
-    _take_less(value, u, found, u + scale * (best - u + one - other) * (rng.uniform(size=u.shape) < share))
 
 
 def _take_less(value: Value, u: Array, found: Array, tried: Array) -> NDArray[np.bool_]:

@@ -178,18 +178,15 @@ def _set(chart: Chart, q: Array, samples: int, collisions: Collisions | None) ->
         known.update(zip(front, found.q[good], strict=True))
     points = np.array(list(known.values()))
     xi = chart.xi(points)
-    widest = tuple(_widest(chart, points, xi, alone[k], k, collisions) for k in range(chart.r))
-    return SelfMotion(chart.x(q), points, xi, 0, XiRange(widest))
-
-
-def _widest(chart: Chart, points: Array, xi: Array, alone: Interval, k: int, collisions: Collisions | None) -> Interval:
-    """The extent of one coordinate: from the outermost points of a set along the coordinate to what stops it."""
-    if not np.isfinite([alone.low, alone.high]).all():
-        return alone
-    down = branch_along(chart, points[np.argmin(xi[:, k])], k, -1, collisions)
-    up = branch_along(chart, points[np.argmax(xi[:, k])], k, 1, collisions)
-    low, high = (float(branch.xi[-1, k]) for branch in (down, up))
-    return Interval(alone.label, alone.here, low, high, down.stop, up.stop)
+    # the extent of each coordinate: from its outermost points, along it, to what stops it
+    extent = list(alone)
+    for k, own in enumerate(alone):
+        if np.isfinite([own.low, own.high]).all():
+            down = branch_along(chart, points[np.argmin(xi[:, k])], k, -1, collisions)
+            up = branch_along(chart, points[np.argmax(xi[:, k])], k, 1, collisions)
+            low, high = (float(branch.xi[-1, k]) for branch in (down, up))
+            extent[k] = Interval(own.label, own.here, low, high, down.stop, up.stop)
+    return SelfMotion(chart.x(q), points, xi, 0, XiRange(tuple(extent)))
 
 
 def branch_along(

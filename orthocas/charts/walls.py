@@ -231,8 +231,15 @@ class Clearance:
         # halve the way until a posture on it keeps clear
         for _ in range(RULES.halvings):
             place = new if fraction == 1.0 else q + fraction * (new - q)
-            if self._allow(q, least, place):
-                return place, fraction
+            value = self.measure(place)
+            if value >= float(self.floor(np.array(least))):
+                # The distances at both ends may not vouch for those between; then the way is searched for a contact.
+                kept = RULES.between * min(self.margin, least, value)
+                vouched = (least + value - self._reach(place - q)) / 2 > kept
+                if vouched or self.collisions.find_contact(np.array([q, place]), kept) is None:
+                    exact = value <= max(RULES.zone * self.margin, self.avoid or 0.0)
+                    self._q, self._least, self._exact = place.copy(), value, exact
+                    return place, fraction
             fraction /= 2
         # nowhere on the way: stay
         self._q, self._least = q.copy(), least
@@ -288,17 +295,3 @@ class Clearance:
     def _reach(self, change: Array) -> float:
         """How much a change of q (n,) can change any distance, at most."""
         return float((self.collisions.rates @ np.abs(change)).max(initial=0.0))
-
-    def _allow(self, q: Array, least: float, new: Array) -> bool:
-        """Whether a step from q with a least distance to a new posture keeps clear; if so, it is the last posture."""
-        # the distance at the end of the step
-        value = self.measure(new)
-        if value < float(self.floor(np.array(least))):
-            return False
-        # and between both ends, where the links may move farther than half of what is left
-        speed = self._reach(new - q)
-        kept = RULES.between * min(self.margin, least, value)
-        if (least + value - speed) / 2 <= kept and self.collisions.find_contact(np.array([q, new]), kept) is not None:
-            return False
-        self._q, self._least, self._exact = new.copy(), value, value <= max(RULES.zone * self.margin, self.avoid or 0.0)
-        return True
