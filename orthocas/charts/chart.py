@@ -49,11 +49,11 @@ Symbolic = TypeVar("Symbolic", ca.SX, ca.MX)
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Chart(Shown):
-    """A problem and its fitted or grown coordinates xi(q) ([AS2023] eq. (27)).
+    """A chart phi(q) = [h(q); xi(q)]: a problem with task h, and fitted or grown coordinates xi ([AS2023] eq. (27)).
 
-    Methods take one joint position (n,), a column (n, 1), or a set (N, n), [rad] or [m]. The methods `xi`, `task`,
-    `phi` and `jacobian` also take a CasADi column (n, 1), SX or MX, and return an expression. Grown coordinates are NaN
-    at points from which the flow does not reach the charted part of the base leaf.
+    Methods take one joint position (n,), a column (n, 1), or a set (N, n), [rad] or [m]. The methods `xi`, `x`, `phi`
+    and `jacobian` also take a CasADi column (n, 1), SX or MX, and return an expression. Grown coordinates are NaN at
+    points from which the flow does not reach the charted part of the base leaf.
 
     Example:
         >>> import numpy as np
@@ -77,20 +77,21 @@ class Chart(Shown):
         require_kind("problem", self.problem, Problem)
         methods = [getattr(type(self.coordinates), name, None) for name in ("xi", "jacobian", "size")]
         if None in methods:
-            raise InvalidValueError("coordinates", f"a {type(self.coordinates).__name__}", "those of a chart")
+            kind = type(self.coordinates).__name__
+            raise InvalidValueError("coordinates", f"a {kind}", "an object with the methods of a CoordinateMap")
         require_kind("notes", self.notes, Mapping)
         object.__setattr__(self, "notes", MappingProxyType(dict(self.notes)))
         if self.certificate is not None:
             self._check_certificate(self.certificate)
 
     def _check_certificate(self, certificate: Certificate) -> None:
-        """Raise CertifyError for a proof of another chart."""
-        from orthocas.charts.chart_file import fingerprint  # all that files may hold, which a fit does not need
+        """Raise CertifyError if the certificate belongs to another chart."""
+        from orthocas.charts.chart_file import fingerprint  # imports all that a file may contain; a fit needs none
 
         certificate.require_for(fingerprint(self.problem, self.coordinates))
 
     def __reduce__(self) -> tuple[type[Self], tuple[Any, ...]]:
-        """Pickle and copy the fields, with the notes as a plain dict: a read-only mapping supports neither."""
+        """Pickle and copy by the fields. The notes become a dict, because a read-only mapping supports neither."""
         parts = {part.name: getattr(self, part.name) for part in fields(self)}
         return type(self), tuple((parts | {"notes": dict(self.notes)}).values())
 
@@ -106,7 +107,7 @@ class Chart(Shown):
 
     @property
     def domain(self) -> Domain:
-        """Where the chart is meant to be used."""
+        """The part of joint space where the chart is valid."""
         return self.problem.domain
 
     @cached_property
@@ -134,7 +135,7 @@ class Chart(Shown):
     @overload
     def xi(self, q: ArrayLike) -> Array: ...
     def xi(self, q: Any) -> Any:
-        """Extra coordinates, (r,) or (N, r)."""
+        """Extra coordinates xi, (r,) or (N, r)."""
         if isinstance(q, ca.SX | ca.MX):
             return self.parts.express("xi", q)
         points, single = as_point_set("q", q, self.n)
@@ -154,7 +155,7 @@ class Chart(Shown):
     @overload
     def phi(self, q: ArrayLike) -> Array: ...
     def phi(self, q: Any) -> Any:
-        """Task values and extra coordinates stacked, (n,) or (N, n)."""
+        """Task values and extra coordinates stacked, phi = [x; xi], (n,) or (N, n)."""
         if isinstance(q, ca.SX | ca.MX):
             return self.parts.express("phi", q)
         points, single = as_point_set("q", q, self.n)
@@ -182,26 +183,26 @@ class Chart(Shown):
     ) -> Array:
         """Solve phi(q) = phi for q: fitted charts by Newton's method with line search, grown ones along the flow.
 
-        Several q may have the same phi, inside the domain too. With `q_start`, q is the one that is reached from there.
-        Without it, q is the first that the search of `solve` finds inside. `solutions` has all.
+        Several q may have the same phi, even inside the domain. With `q_start`, the result is the solution reached from
+        there. Without it, the result is the first solution inside that `solve` finds. `solutions` looks for all.
 
         Args:
             phi: target values, (n,) or (N, n).
             q_start: initial guess (n,), or (N, n) with one guess per row of phi. For grown coordinates it selects the
                 number of full turns and the sheet of a linear leaf.
-            outside: accept solutions outside the domain, where the chart is not known to be good, and beyond joint
-                limits.
-            tolerance: largest remaining |phi(q) - phi|, relative to the sizes of the components: how far those of the
-                task move over the domain, and 1 for xi.
+            outside: also accept solutions outside the domain, where the quality of the chart is unknown, and solutions
+                beyond the joint limits.
+            tolerance: largest error of a component of phi(q), divided by the size of that component. The size of a
+                task component is about its range over the domain; the size of a component of xi is 1.
 
         Returns:
             q, (n,) or (N, n), inside the domain unless `outside`.
 
         Raises:
-            InverseError: if no solution is found, J is singular there, or it lies outside the domain. The message names
-                the rows. If solutions lie outside, `error.nearest` has q, (n,) or (N, n), inside the domain: solutions
-                where there are any, otherwise the same x with the nearest xi that is found (see `solve` with
-                `inside=True`); None for grown coordinates.
+            InverseError: if no solution is found, if J is singular at the solution, or if the solution lies outside the
+                domain. The message names the rows. In the last case, `error.nearest` holds q inside the domain, (n,) or
+                (N, n): a solution where one exists, otherwise the same x with the nearest xi found, as from `solve`
+                with `inside=True`. It is None for grown coordinates.
 
         Example:
             >>> import orthocas as oc
@@ -234,40 +235,42 @@ class Chart(Shown):
         all: bool = False,  # noqa: A002
         collisions: Collisions | None = None,
     ) -> Solutions:
-        """Solve phi(q) = phi for q, with a status for each row: a row that fails does not disturb the others.
+        """Solve phi(q) = phi for q. Each row gets a status of its own, so a row that fails does not stop the others.
 
-        Several q may have the same phi, inside the domain too. With `q_start`, Newton's method searches from there
-        only, and q is the solution that it reaches. Where that is none inside the domain, q follows the straight line
-        from phi(q_start) to phi, so that every xi within `xi_range(q_start)` is found. Without a start, Newton's method
-        starts at a rough inverse of phi, a polynomial fitted to points of the domain, then at stored points of the
-        domain whose phi is nearest. Rows that still have no solution inside are searched for along the self-motion
-        curves of x (r = 1, or some of them in wide charts), or from more stored points. q is the first solution inside
-        that is found; `solutions` looks for all.
+        Several q may have the same phi, even inside the domain. With `q_start`, Newton's method starts there only, and
+        q is the solution that it reaches. If that solution is missing or outside the domain, q instead follows the
+        straight line from phi(q_start) to phi, which finds every xi within `xi_range(q_start)`. Without `q_start`,
+        Newton's method starts at a polynomial fit of the inverse, then at stored points of the domain whose phi is
+        nearest. For rows that still have no solution inside, the search continues along the self-motion curves of x
+        (for r = 1, and along some of them in wide charts with r > 1), or from more stored points. The result is the
+        first solution found inside; `solutions` looks for all.
 
         Args:
             phi: target values, (n,) or (N, n). Rows that are not finite get the status BAD_INPUT.
             q_start: initial guess (n,), or (N, n) with one guess per row of phi.
-            x: in place of phi, with `xi`: task values (m,) or (N, m), or poses as `Task.target` takes them.
-            xi: coordinates (r,) or (N, r); one for many x, or many for one.
-            tolerance: largest remaining |phi(q) - phi|, as in `inverse`.
-            inside: keep q in the domain, and so within the joint limits. Rows without a solution there, from q_start or
-                other starts, get the q inside with the same x and the nearest xi that is found, with the status
-                NEAREST. If none with that x is found inside, the status is OUTSIDE_DOMAIN with a q within the box of
-                the domain that has it, such as one too near to a singular position, or else NOT_FOUND. With r = 1, the
-                nearest is that on all self-motion curves of x that are found; with more coordinates, a local minimum.
-                Not for grown coordinates.
-            all: for one phi: every solution inside the domain that `solutions` finds, in rows.
-            collisions: of the chart's robot, such as `robot.collisions`. Rows whose solution touches something get the
-                nearest free one of all solutions that are found, or else the status COLLIDING. With `all`, free ones
-                come first. A NEAREST that touches is COLLIDING; `self_motion` knows what is free there.
+            x: task values (m,) or (N, m), or poses as `Task.target` takes them. `x` and `xi` together replace `phi`.
+            xi: coordinates (r,) or (N, r). One xi may go with many x, and many xi with one x.
+            tolerance: largest error of phi(q), as in `inverse`.
+            inside: keep q in the domain, and so within the joint limits. A row without a solution there gets the status
+                NEAREST and a q inside the domain with the same x and the nearest xi found. With r = 1, that is the
+                nearest xi on all self-motion curves of x that are found; with r > 1, it is a local minimum of the
+                distance. If no q with that x is found inside, the row gets a q in the box of the domain with that x and
+                the status OUTSIDE_DOMAIN, for example near a singular position; without such a q, the status is
+                NOT_FOUND. Not available for grown coordinates.
+            all: for one phi: return every solution inside the domain that `solutions` finds, one per row.
+            collisions: a collision model of the chart's robot, such as `robot.collisions`. If the solution of a row is
+                in collision, the row gets the nearest free solution that is found, or else the status COLLIDING. With
+                `all`, free solutions come first. A NEAREST point in collision gets the status COLLIDING;
+                `self_motion` shows which positions with that x are free.
 
         Returns:
             `Solutions` with q (N, n), status, iterations, error and distance (N,); N = 1 for one phi.
 
         Raises:
-            ShapeError: if a row has another number of entries, or q_start another number of rows.
-            InvalidValueError: if `all` comes with several phi, a start or `inside`, or collisions are another robot's.
-            NoExpressionError: if `inside` or `all` is asked of grown coordinates.
+            ShapeError: if a row does not have n entries, or q_start has another number of rows than phi.
+            InvalidValueError: if `all` is combined with several phi, `q_start` or `inside`, or if the collision model
+                belongs to another robot.
+            NoExpressionError: if `inside` or `all` is used with grown coordinates.
 
         Source:
             ours: docs/how-to/inverse.md.
@@ -276,32 +279,32 @@ class Chart(Shown):
         if collisions is not None:
             require_collisions(collisions, self.problem.robot.tree)
         require_kind("all", all, bool)
-        # all solutions of one phi
+        # all solutions for one phi
         if all:
             if q_start is not None or inside:
                 raise InvalidValueError("all", "given with q_start or inside", "all alone")
             return solve_all(self, as_point("phi", phi, self.n), tolerance, collisions)
-        # one solution for each row, and where it touches something another one
+        # one solution for each row; solutions in collision are replaced by free ones
         found = solve_rows(self, self.parts.inverse, phi, q_start, tolerance, inside)
         return found if collisions is None else prefer_free(self, phi, found, collisions)
 
     def nearest_xi(self, q_wish: ArrayLike, x: Any = None, *, tolerance: float = 1e-9) -> Solutions:
-        """Joint positions in the domain with task values x, and of these the xi nearest to that of a wished posture.
+        """Joint positions in the domain with task values x whose xi is nearest to that of a desired posture q_wish.
 
-        For postures of a person or a demonstration, which the arm is to resemble while its hand is elsewhere. It is
-        `solve` for phi = [x; xi(q_wish)] with `inside=True`, from q_wish.
+        One use is to imitate the posture of a person or a demonstration while the hand is at another x. The method is
+        `solve` for phi = [x; xi(q_wish)] with `inside=True`, started at q_wish.
 
         Args:
-            q_wish: wished joint positions, (n,) or (N, n). What lies beyond the box of the domain is moved to its face.
+            q_wish: desired joint positions, (n,) or (N, n). They are clipped to the box of the domain.
             x: task values, (m,) or (N, m), or poses as `Task.target` takes them. Default: those of q_wish.
             tolerance: as in `solve`.
 
         Returns:
-            As `solve`: FOUND where a position with that xi was found, NEAREST where only others with that x were
-            found, OUTSIDE_DOMAIN where only such outside the domain were, NOT_FOUND where none was.
+            As `solve`. The status is FOUND if q has this x and xi(q_wish), NEAREST if it has this x and another xi,
+            OUTSIDE_DOMAIN if positions with this x were found only outside the domain, and NOT_FOUND if there are none.
 
         Raises:
-            ShapeError: if a row has another number of entries, or x another number of rows.
+            ShapeError: if a row of q_wish does not have n entries, or x has another number of rows or entries.
             NoExpressionError: for grown coordinates.
         """
         phi, wishes = build_phi_of_wish(self, q_wish, x)
@@ -310,19 +313,21 @@ class Chart(Shown):
     def solutions(self, phi: ArrayLike, tolerance: float = 1e-9, collisions: Collisions | None = None) -> Array:
         """All q inside the domain with phi(q) = phi that a search of the whole domain finds.
 
-        A chart without a fold may have several: det J != 0 makes phi one-to-one near each point only. On the box of a
-        certificate's proof "one-to-one", there is at most one. With r = 1 the search follows all self-motion curves of
-        x, with more coordinates it descends from stored positions. It is no proof that there are no others;
-        docs/explanation/inverse.md has what it misses.
+        Even a chart without a fold may have several solutions, because det J != 0 makes phi one-to-one only locally. On
+        the box of a certificate's proof "one-to-one", there is at most one. With r = 1 the search follows all
+        self-motion curves of x that it finds; with r > 1 it descends from stored positions. The search does not prove
+        that there are no other solutions; docs/explanation/inverse.md says what it may miss.
 
         Args:
             phi: target values, (n,).
             tolerance: as in `solve`.
-            collisions: of the chart's robot: solutions without a contact come first. `solve` with `all` says which.
+            collisions: a collision model of the chart's robot: free solutions come first. `solve` with `all` also
+                returns the status of each solution.
 
         Returns:
-            Solutions that differ by more than full turns of joints without boundaries, the one nearest to the centre of
-            the domain first, (k, n). Where full turns change xi, those within one and a half turns of the centre.
+            Solutions (k, n), the one nearest to the centre of the domain first. Of solutions that differ only by full
+            turns of joints without boundaries, one is returned. If full turns of such a joint change xi, the solutions
+            within one and a half turns of the domain's home are returned.
 
         Raises:
             NoExpressionError: if the coordinates are grown.
@@ -354,15 +359,16 @@ class Chart(Shown):
             q0: a joint position inside the domain, (n,).
             largest_step: largest change of each joint in a call, (n,) or one number [rad] or [m]; default: a tenth of
                 the half-widths of the domain.
-            nearest: where phi is out of reach, descend to the nearest x, and with that to the nearest xi, instead of
-                staying where it was; see `ReachingTracker`.
-            collisions: of the chart's robot, such as `robot.collisions`: no call comes nearer to a contact than margin.
-            margin: that distance [m]. Default: 0.01.
-            avoid: distance below which xi gives way [m], above the margin. Default: it does not.
+            nearest: if phi is out of reach, descend to the nearest x, and with that x to the nearest xi, instead of
+                staying at the last q; see `ReachingTracker`.
+            collisions: a collision model of the chart's robot, such as `robot.collisions`. The tracker then keeps all
+                pairs at a distance of at least `margin`.
+            margin: smallest distance to a contact [m]. Default: 0.01.
+            avoid: distance to a contact below which xi yields [m]; larger than `margin`. Default: xi does not yield.
 
         Raises:
             NoExpressionError: if the coordinates are grown.
-            InvalidValueError: if q0 lies outside the domain, J is singular there, or a pair touches.
+            InvalidValueError: if q0 lies outside the domain, if J is singular there, or if a pair touches there.
             DomainError: if the domain has a condition, but no expression of it.
         """
         require_expression(self, "a tracker")
@@ -374,10 +380,10 @@ class Chart(Shown):
     def function(self, name: str) -> ca.Function:
         """A CasADi function: xi, phi, jacobian, task, task_jacobian, manipulability, second_derivative, inverse.
 
-        The input q is a column (n, 1). second_derivative takes q, v, w (n, 1) and returns d^2 phi(q)[v, w] =
-        (d/ds) J(q + s v) w, (n, 1). For v = dq this is dJ/dt w. inverse takes phi and q_start (n, 1), and returns q
-        (n, 1) with phi(q) = phi, or NaN where Newton's method finds none. Its derivatives are those of the implicit
-        function theorem, of any order; so it can be part of an optimal control problem. The gradient of the
+        The input q is a column (n, 1). `second_derivative` takes q, v, w (n, 1) and returns d^2 phi(q)[v, w] =
+        (d/ds) J(q + s v) w, (n, 1); for v = dq this is dJ/dt w. `inverse` takes phi and q_start (n, 1), and returns a q
+        (n, 1) with phi(q) = phi, or NaN if Newton's method finds none. Its derivatives follow from the implicit
+        function theorem, in any order, so `inverse` can be part of an optimal control problem. The gradient of the
         manipulability is `chart.function("manipulability").jacobian()`, away from singular positions.
 
         Raises:
@@ -388,22 +394,23 @@ class Chart(Shown):
         return self.parts.functions[name]
 
     def xi_range(self, q: ArrayLike, collisions: Collisions | None = None) -> XiRange:
-        """How far each extra coordinate reaches alone from q, the task value and the other coordinates held.
+        """Range of each extra coordinate from q, with the task value and the other coordinates held.
 
-        For each coordinate, the curve through q along which only that coordinate changes is followed in both directions
-        until it leaves the domain or meets a fold. The ends are exact to 1e-9; the path between them is checked at
-        steps of at most 0.1 rad or m.
+        For each coordinate, the method follows the curve through q on which only that coordinate changes, in both
+        directions, until the curve leaves the domain or meets a fold. The ends are exact to 1e-9; the curve between
+        them is checked at steps of at most 0.1 rad or m.
 
-        With r = 1 and no collisions it is C, compiled at the first call for a chart (a second or two) and kept for
-        later ones; without a C compiler, Python finds the same in some ten times the time.
+        With r = 1 and no collision model, the curve is followed in C. The code is compiled at the first call for a
+        chart, in a second or two, and kept for later calls. Without a C compiler, Python finds the same in about ten
+        times the time.
 
         Args:
             q: a joint position (n,) inside the domain.
-            collisions: of the chart's robot, such as `robot.collisions`: a range ends where a pair touches, which its
-                stop names. Contacts deeper than 0.1 mm are not passed between steps.
+            collisions: a collision model of the chart's robot, such as `robot.collisions`. A range then also ends where
+                a pair touches, and its stop names the pair. No contact deeper than 0.1 mm is missed between steps.
 
         Returns:
-            An `Interval` for each coordinate: lowest and highest value, and what stops it there.
+            An `Interval` for each coordinate: lowest and highest value, and what stops the coordinate there.
 
         Raises:
             ShapeError, InvalidValueError: if q is not a joint position inside the domain.
@@ -425,21 +432,23 @@ class Chart(Shown):
     def self_motion(
         self, q: ArrayLike, step: float = 0.05, samples: int = 1000, collisions: Collisions | None = None
     ) -> SelfMotion:
-        """What can move at the task value of q without leaving the domain.
+        """Joint positions that the arm can reach from q inside the domain without changing the task value.
 
-        With r = 1 it is the curve through q, followed along the null space of J_x in both directions until it leaves
-        the domain or closes. It goes on where the coordinate turns back. With r > 1 it is a set of points on a lattice
-        in xi, filled from q on, and as far as the chart does not fold. All points have the task value of q to 1e-9.
+        With r = 1 they form the curve through q along the null space of J_x, followed in both directions until it
+        leaves the domain or closes. The curve does not end where the coordinate turns back. With r > 1 they are points
+        on a lattice in xi, filled from q outwards, on the same side of any fold as q. All points have the task value of
+        q to 1e-9.
 
         Args:
             q: a joint position (n,) inside the domain.
-            step: for r = 1: the largest distance of points along the curve [rad] or [m].
-            samples: for r > 1: about how many points, at most 10,000.
-            collisions: as in `xi_range`; with r > 1, points of the set are free, the ways between them are not checked.
+            step: for r = 1: largest distance between points along the curve [rad] or [m].
+            samples: for r > 1: approximate number of points, at most 10,000.
+            collisions: as in `xi_range`. With r > 1, all points are free, but the paths between them are not checked.
 
         Returns:
-            Joint positions, their coordinates, and how far each coordinate reaches: exactly for r = 1, at least so far
-            for r > 1. With r = 1 a `SelfMotionCurve`, with the length of the curve and whether it closes.
+            Joint positions, their coordinates, and the range of each coordinate: exact for r = 1, a lower bound of the
+            range for r > 1. With r = 1 the result is a `SelfMotionCurve`, which also has the length of the curve and
+            whether it closes.
 
         Raises:
             ShapeError, InvalidValueError: if q is not a joint position inside the domain, or a number is out of range.
@@ -458,14 +467,14 @@ class Chart(Shown):
         return self_motion(self, q, step, samples, collisions)
 
     def quality(self, q: ArrayLike) -> PointQuality:
-        """How good the chart is at one joint position (n,), or at each of a set or a path (N, n).
+        """Quality of the chart at one joint position (n,), or at each of several (N, n).
 
         Returns:
             The leak of each coordinate [deg], the conditioning, and the distance to the boundary of the domain. The
             leak is the angle in the metric between the gradient of a coordinate and the space orthogonal to the task.
 
         Raises:
-            ShapeError, InvalidValueError: if q has another number of joints, or is not finite.
+            ShapeError, InvalidValueError: if q does not have n joints, or is not finite.
 
         Example:
             >>> import orthocas as oc
@@ -482,22 +491,22 @@ class Chart(Shown):
         return found
 
     def manipulability(self, q: ArrayLike) -> Array:
-        """w = sqrt(det(J J^T)) of the task at q (n,), or at each row of (N, n): `Task.manipulability`."""
+        """Manipulability w = sqrt(det(J_x J_x^T)) at q, (n,) or (N, n); see `Task.manipulability`."""
         return self.task.manipulability(q)
 
     def manipulability_gradient(self, q: ArrayLike, along: str = "q") -> Array:
-        """How the manipulability w changes at q (n,), or at each row of (N, n).
+        """Gradient of the manipulability w with respect to q, or to xi with x held.
 
         Args:
             q: a joint position (n,), or several (N, n).
-            along: "q" gives dw/dq, (n,) or (N, n). "xi" gives the change along each coordinate with x and the others
-                held, (r,) or (N, r): the last r entries of dw/dq J^-1.
+            along: "q" gives dw/dq, (n,) or (N, n). "xi" gives dw/dxi with x held, (r,) or (N, r): the last r entries of
+                dw/dq J^-1.
 
         Returns:
             The gradient; NaN at singular positions of the task.
 
         Raises:
-            ShapeError, InvalidValueError: for bad positions, or another word for `along`.
+            ShapeError, InvalidValueError: if q is invalid, or `along` is neither "q" nor "xi".
 
         Source:
             Along q: [Y1985], differentiated; along xi: ours.
@@ -519,7 +528,7 @@ class Chart(Shown):
         return np.asarray(rows[..., self.m :])
 
     def facts(self) -> dict[str, str]:
-        """Coordinates, problem, and how it was made."""
+        """Coordinates, problem, and how the chart was made."""
         problem = self.problem.facts()
         made = listed(
             f"{name} {value:.6g}" if isinstance(value, float) else f"{name} {value}"
@@ -535,33 +544,31 @@ class Chart(Shown):
         }
 
     def plot(self) -> Figure:
-        """The arm along each coordinate, as far as it reaches from the centre of the domain, with the task held.
+        """Plot the arm along the range of each coordinate, from the home of the domain, with all else held.
 
         Returns:
             A matplotlib figure with one panel for each coordinate, which notebooks show.
-
-        Raises:
-            InvalidValueError: if the chart is not finite at the centre of the domain.
         """
-        from orthocas.charts.figures import self_motion_figure  # with matplotlib, which takes long to import
+        from orthocas.charts.figures import self_motion_figure  # imports matplotlib, which takes long
 
         return self_motion_figure(self)
 
     def save(self, path: str | Path, force: bool = False, collisions: Collisions | None = None) -> None:
-        """Write a self-contained chart file. It replaces a chart file of that name, and with `force` any other file.
+        """Write a self-contained chart file. An existing chart file is replaced; other files only with `force`.
 
         Args:
             path: the file.
-            force: replace a file that is no chart.
-            collisions: of the chart's robot, such as `robot.collisions`: the file holds its solids and pairs, which
-                `chart.robot.collisions` of the loaded chart has, with corners of hulls in single precision.
+            force: also replace an existing file that is not a chart file.
+            collisions: a collision model of the chart's robot, such as `robot.collisions`. Its solids and pairs are
+                stored in the file, with the vertices of hulls in single precision. The loaded chart has them as
+                `chart.robot.collisions`.
 
         Raises:
-            InvalidValueError: if collisions are another robot's.
-            ChartFileError: if the folder is missing or cannot be written, if there is a file that is no chart, or a
-                symbolic link.
+            InvalidValueError: if the collision model belongs to another robot.
+            ChartFileError: if the folder is missing or cannot be written, or if `path` is a symbolic link or a file
+                that is not a chart.
         """
-        from orthocas.charts.chart_file import write_chart  # all that files may hold, which a fit does not need
+        from orthocas.charts.chart_file import write_chart  # imports all that a file may contain; a fit needs none
 
         require_collisions(collisions, self.problem.robot.tree)
         target = as_path("path", path)
@@ -569,34 +576,32 @@ class Chart(Shown):
 
     @cached_property
     def parts(self) -> ChartParts:
-        """What other packages of orthocas use of a chart; it may change without notice."""
+        """Internal parts of the chart for other packages of orthocas; they may change without notice."""
         return ChartParts(self)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class GrownChart(Chart):
-    """A chart with grown coordinates. It has the interface of a fitted chart except for `function`.
+    """A chart with grown coordinates. Methods that need a CasADi expression of xi raise NoExpressionError.
 
-    `coordinates.leaf` is the base leaf. `coordinates.pull` gives the point of it that each q flows to, with a status.
+    `coordinates.leaf` is the base leaf. `coordinates.pull` returns the point of the leaf to which each q flows, with a
+    status.
     """
 
     coordinates: GrownCoordinates
 
     def __post_init__(self) -> None:
-        from orthocas.exact.flow import GrownCoordinates  # flows and meshes, which fitted charts do not need
+        from orthocas.exact.flow import GrownCoordinates  # imports flows and meshes; fitted charts need none
 
         if not isinstance(self.coordinates, GrownCoordinates):
-            raise InvalidValueError(
-                "chart",
-                f"one with {getattr(self.coordinates, 'label', type(self.coordinates).__name__)} coordinates",
-                "a grown chart",
-            )
+            kind = getattr(self.coordinates, "label", type(self.coordinates).__name__)
+            raise InvalidValueError("coordinates", kind, "grown coordinates")
         Chart.__post_init__(self)
 
 
 def load_file(path: Path) -> Chart:
-    """Read a chart file. A grown chart comes back as a `GrownChart`."""
-    from orthocas.charts.chart_file import read_chart  # all that files may hold, which a fit does not need
+    """Read a chart file. A grown chart is returned as a `GrownChart`."""
+    from orthocas.charts.chart_file import read_chart  # imports all that a file may contain; a fit needs none
     from orthocas.exact.flow import GrownCoordinates
 
     problem, coordinates, notes, certificate = read_chart(path)
