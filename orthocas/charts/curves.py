@@ -1,4 +1,4 @@
-"""The self-motion curves of many task values at once, r = 1, and the points on them whose xi is nearest."""
+"""Search of self-motion curves, r = 1, for many task values at once: the points on them whose xi is nearest."""
 
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -14,25 +14,25 @@ from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array, Indices
 from orthocas.tools.expressions import wrap_shortest
 
-_AT_ONCE = 2048  # rows whose curves are held in memory
+_AT_ONCE = 2048  # rows searched at once, to bound the memory for their curves
 
 
 @dataclass(frozen=True, eq=False)
 class Nearest:
-    """The best point of each of N rows."""
+    """The best point found so far for each of N targets."""
 
     q: Array  #: (N, n)
     distance: Array  #: |xi - xi(q)|, (N,); 0 for solutions, infinite for rows without a point in the domain
-    between: NDArray[np.bool_]  #: rows whose q is neither a solution nor an end of an arc, (N,)
+    between: NDArray[np.bool_]  #: whether q is a sample within an arc, neither a solution nor an end of it, (N,)
 
     @classmethod
     def empty(cls, starts: Array) -> "Nearest":
-        """No points yet; q holds the starts (N, n)."""
+        """No points yet: infinite distances; q holds the starts (N, n)."""
         return cls(starts.copy(), np.full(len(starts), np.inf), np.zeros(len(starts), dtype=bool))
 
     def take(self, rows: Indices, q: Array, distance: Array, between: bool = False) -> None:
-        """Keep those points (M, n) that are nearer than the best so far of their rows (M,); a row may occur twice."""
-        # what is written last stays
+        """Keep the points q (M, n) that are nearer than the best so far of their rows (M,); a row may occur twice."""
+        # nearest last, because the last assignment to a row stays
         farthest_first = np.argsort(-distance, kind="stable")
         better = farthest_first[distance[farthest_first] < self.distance[rows[farthest_first]]]
         self.q[rows[better]], self.distance[rows[better]] = q[better], distance[better]
@@ -43,42 +43,45 @@ class Nearest:
 class SelfMotionCurves:
     """Finds q in the domain with h(q) = x and the nearest xi, along all self-motion curves of x that it finds.
 
-    For charts with r = 1. All positions of a regular x form closed curves in the torus of the joints. The search
+    For charts with r = 1. If x is regular, all q with h(q) = x form closed curves in the torus of the joints. The
+    search
 
-    1. leads stored positions near x to x by damped least squares, whatever the limits,
-    2. traces the curve through each that does not lie on a known one, whatever the limits,
-    3. cuts the curves by the domain, and looks for xi on the parts inside.
+    1. moves stored positions near x to x by damped least squares, ignoring limits,
+    2. traces the curve through each that does not lie on a curve traced before, ignoring limits,
+    3. intersects the curves with the domain; each part inside is called an arc,
+    4. looks for xi on the arcs.
 
-    On a part, the nearest xi is a root of xi(q) = xi_d, an end of the part, or a place where xi turns back. So the
-    result is the nearest one on all curves that were found, up to parts shorter than `RULES.step / RULES.parts`.
+    On an arc, the nearest xi is a root of xi(q) = xi_d, an end of the arc, or a point where xi turns back. So the
+    result is the nearest xi on all curves found. Arcs shorter than `RULES.step / RULES.parts` may be missed.
     """
 
     boxed: BoxedPhi
     starts: Starts
     tracer: CurveTracer
-    kernel: SearchKernel  #: does the same in C, where it can be compiled
+    kernel: SearchKernel  #: the same search in C, if it can be compiled
 
     def search(self, targets: Array, own: Array, tolerance: float) -> Nearest:
-        """The nearest points for targets (N, n) of phi, from stored starts and one of the caller's (N, n)."""
+        """Nearest points for targets phi (N, n); curves start at stored positions and at the caller's `own` (N, n)."""
         pieces = [slice(first, first + _AT_ONCE) for first in range(0, len(own), _AT_ONCE)]
         found = [self._search(targets[rows], own[rows], tolerance) for rows in pieces]
         parts = zip(*(vars(part).values() for part in (Nearest.empty(own[:0]), *found)), strict=True)
         return Nearest(*(np.concatenate(arrays) for arrays in parts))
 
     def find_all(self, target: Array, near: Array, tolerance: float) -> Array:
-        """Solutions inside for a target (n,) of phi on all curves of x that are found, some several times, (k, n).
+        """Solutions inside the domain for a target phi (n,), on all curves of x that are found, (k, n).
 
-        Curves are sought from positions (S, n) near solutions as well.
+        A solution may occur several times. Curves start at stored positions and at `near` (S, n), positions near
+        solutions.
         """
         targets, own, found = target[None], self.boxed.domain.home[None], [np.empty((0, len(target)))]
         starts = np.concatenate([near[:, None], *self.stages(targets, own)])
         with np.errstate(all="ignore"):
             for traces in self._trace_all(targets, starts):
-                # xi - xi(q) at points close to one another
+                # xi - xi(q) at closely spaced points
                 points = self._steps(traces, own).divided()[0]
                 flat = points.reshape(-1, len(target))
                 left = self._xi_left(np.broadcast_to(targets, flat.shape), flat).reshape(points.shape[:2])
-                # a root may lie beside points where no more is left than changes to a neighbour
+                # a root may lie beside a point if |xi - xi(q)| there is no larger than its change to a neighbour
                 change = np.abs(np.diff(left, axis=1))
                 change = np.where(change > self._period / 2, np.inf, change)
                 close = np.zeros(left.shape, dtype=bool)
@@ -89,28 +92,29 @@ class SelfMotionCurves:
         return np.concatenate(found)
 
     def list_points(self, target: Array, parts: int) -> Array:
-        """Points (K, n) in the domain on all curves of x that are found, at most `RULES.step / parts` apart.
+        """Points (K, n) in the domain on all curves of x that are found, at most about `RULES.step / parts` apart.
 
-        Curves are sought from positions near a target (n,) of phi. Joints turn within their ranges by full turns, and
-        those without a range within half a turn of the domain's home, or one and a half where turns change xi.
+        Curves start at stored positions near a target phi (n,). They are shifted by all full turns that fit into the
+        joint ranges. Joints without a range stay within half a turn of the domain's home, or within one and a half
+        turns if their turns change xi.
         """
         own, found = self.boxed.domain.home[None], [np.empty((0, len(target)))]
         starts = np.concatenate(self.stages(target[None], own))
         with np.errstate(all="ignore"):
             for traces in self._trace_all(target[None], starts):
-                # without the ends of steps, with which the next ones begin
+                # leave out the end of each step, because the next step begins there
                 q, t = (part[:, :-1].reshape(-1, len(target)) for part in self._steps(traces, own).divided(parts))
                 x = np.broadcast_to(target[: self.boxed.m], (len(q), self.boxed.m))
                 for _ in range(RULES.corrections):
                     move = self.tracer.correct(x, q, t)[0]
                     q = q + move
-                # where the last move was long, or none, x is not reached
+                # drop points whose last correction was long or NaN: they have not reached x
                 q = q[np.abs(move).max(axis=1, initial=0.0) < RULES.last_correction]
                 found.append(q[self.boxed.domain.contains(q)])
         return np.concatenate(found)
 
     def _trace_all(self, targets: Array, starts: Array) -> Iterator[Traces]:
-        """The curves of one target (1, n) to which starts (S, 1, n) lead, one after the other."""
+        """Yield the curves of one target (1, n) to which starts (S, 1, n) lead, each once."""
         row = np.zeros(1, dtype=np.int64)
         if self.has_kernel:
             for q, t in self.kernel.trace(targets[0], starts[:, 0]):
@@ -119,7 +123,7 @@ class SelfMotionCurves:
         q, known = self._reach(targets, starts)
         away = self.tracer.away(q)[0]
         while not known.all():
-            # the next curve, through the start nearest to the domain that lies on none so far
+            # trace the next curve from a start that lies on no traced curve; the start nearest to the domain first
             start = np.argmin(np.where(known[0], np.inf, away))
             traces = self.tracer.trace(targets[:, : self.boxed.m], q[:, start], row)
             known[0, start] = True
@@ -127,6 +131,7 @@ class SelfMotionCurves:
             yield traces
 
     def _search(self, targets: Array, own: Array, tolerance: float) -> Nearest:
+        """`search` for so few rows that their curves fit into memory."""
         if self.has_kernel:
             first, more = self.stages(targets, own)
             starts = np.concatenate([first, more]).transpose(1, 0, 2)
@@ -137,10 +142,10 @@ class SelfMotionCurves:
                 rows = np.flatnonzero(best.distance > 0)
                 if rows.size:
                     ends = ends.joined(self._search_from(targets, rows, starts[:, rows], own, traced, tolerance, best))
-            # halve between the point inside and the one outside, for ends of arcs that may be the nearest
+            # bisect between inside and outside for the ends of arcs that may be nearer than the best point so far
             useful = np.flatnonzero(ends.least < best.distance[ends.row])
             rows, a, b = ends.row[useful], ends.inside[useful], ends.outside[useful]
-            # Far along a joint without boundaries, floats may be farther apart than the goal: the rounds are bounded.
+            # Rounds are bounded: far along a joint without boundaries, floats are farther apart than `narrow`.
             for _ in range(RULES.narrowings):
                 if np.abs(b - a).max(initial=0.0) <= RULES.narrow:
                     break
@@ -155,7 +160,10 @@ class SelfMotionCurves:
         return best
 
     def stages(self, targets: Array, own: Array) -> tuple[Array, Array]:
-        """The caller's starts and stored positions near phi and near x, and more of these, (S, N, n) each."""
+        """Starts in two stages, (S, N, n) each: the second one, more stored positions near x, is for unsolved rows.
+
+        The first stage holds the caller's `own` (N, n) and stored positions near phi and near x.
+        """
         near_phi = self.starts.nearest(targets, RULES.near_phi, targets.shape[1])
         near_x = self.starts.nearest(targets, RULES.near_x + RULES.more, self.boxed.m)
         return np.concatenate([own[None], near_phi, near_x[: RULES.near_x]]), near_x[RULES.near_x :]
@@ -170,22 +178,26 @@ class SelfMotionCurves:
         tolerance: float,
         best: Nearest,
     ) -> "Ends":
-        """Search some rows from starts (S, rows, n), and add to the curves that are traced; returns ends of arcs."""
+        """Search some rows from starts (S, rows, n); update `best` and append the new curves to `traced`.
+
+        Returns:
+            Ends of arcs that may be nearer than the best points.
+        """
         q, known = self._reach(targets[rows], starts)
         place, ends = np.full(len(targets), -1), Ends.empty(q.shape[2])
         place[rows] = np.arange(len(rows))
-        # starts on curves that are known already need no search
+        # starts on curves of earlier stages need no search
         for traces in traced:
             here = np.flatnonzero(place[traces.row] >= 0)
             of = place[traces.row[here]]
             known[of] |= self.tracer.on_curves(q[of], traces.part(here))
         away = self.tracer.away(q)
-        # in each round, trace from starts that no curve has reached
+        # in each round, trace curves from starts that lie on no curve so far
         for _ in range(q.shape[1]):
             left = np.flatnonzero(~known.all(axis=1) & (best.distance[rows] > 0))
             if not left.size:
                 break
-            # with many rows one start each, the nearest to the domain; with few all at once
+            # with many rows, one start of each row: the one nearest to the domain; with few rows, all starts
             if left.size > RULES.few:
                 of, start = left, np.argmin(np.where(known[left], np.inf, away[left]), axis=1)
             else:
@@ -193,7 +205,7 @@ class SelfMotionCurves:
                 of = left[at]
             traces = self.tracer.trace(targets[rows[of], : self.boxed.m], q[of, start], rows[of])
             known[of, start] = True
-            # roots on the steps, then on arcs that may hold one
+            # look for roots of xi on the long steps, then on closely spaced points of arcs that may hold one
             steps = self._steps(traces, own[traces.row])
             xi_left = self._take_crossed(targets, steps, tolerance, best)
             more = best.distance[steps.row] > 0
@@ -205,24 +217,31 @@ class SelfMotionCurves:
             guess = (1 - share) * arcs.q[arc, place] + share * arcs.q[arc, place + 1]
             self._take_solutions(targets, arcs.row[arc], guess, tolerance, best)
             ends = ends.joined(self._take_points(targets, arcs, best))
-            # other starts on these curves are done, too
+            # mark other starts that lie on the new curves
             on = np.flatnonzero((best.distance[traces.row] > 0) & ~known[of].all(axis=1))
             np.logical_or.at(known, of[on], self.tracer.on_curves(q[of[on]], traces.part(on)))
             traced.append(traces)
         return ends
 
     def _reach(self, targets: Array, starts: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Positions (N, S, n) near the task values of targets, and which starts (S, N, n) led to none, (N, S)."""
+        """Move starts (S, N, n) to the task values of targets (N, n); limits are ignored.
+
+        Returns:
+            Positions (N, S, n), and which of them did not reach their task value, (N, S).
+        """
         S, N, n = starts.shape
         x = np.repeat(targets[:, : self.boxed.m], S, axis=0)
         q, arrived = self.tracer.reach(x, starts.transpose(1, 0, 2).reshape(-1, n))
         return q.reshape(N, S, n), ~arrived.reshape(N, S)
 
     def _steps(self, traces: Traces, own: Array) -> "Steps":
-        """The steps of all curves in and around the box of the domain, moved there by full turns."""
+        """The steps of all curves that lie in or near the box of the domain, after shifts by full turns.
+
+        `own` (K, n) are the positions near which joints without boundaries are placed.
+        """
         curve, shift = self._sheets(traces, own)
         low, high = self.boxed.domain.bounds
-        # steps of which one end is near the box
+        # steps with at least one end near the box
         moved = traces.q[curve] + shift[:, None]
         near = np.asarray(((moved >= low - RULES.step) & (moved <= high + RULES.step)).all(axis=2))
         at, place = np.nonzero((near[:, :-1] | near[:, 1:]) & (np.arange(1, near.shape[1]) < traces.count[curve, None]))
@@ -234,12 +253,12 @@ class SelfMotionCurves:
         return Steps(traces.row[of], q, t, follows)
 
     def _take_crossed(self, targets: Array, steps: "Steps", tolerance: float, best: Nearest) -> Array:
-        """Solutions of phi(q) = phi on steps along which xi passes its target, in or near the box.
+        """Solve phi(q) = phi on steps along which xi crosses its target; take the solutions inside into `best`.
 
         Returns:
             xi - xi(q) at both ends of the steps, (S, 2); NaN far from the box.
         """
-        # xi - xi(q) at both ends of steps, (S, 2); NaN far from the box
+        # A step that follows another one shares its first end with it, so xi is evaluated there once.
         left, low, high = np.full(steps.q.shape[:2], np.nan), *self.boxed.domain.bounds
         slack = RULES.step / RULES.parts
         near = np.asarray(((steps.q >= low - slack) & (steps.q <= high + slack)).all(axis=2))
@@ -254,17 +273,17 @@ class SelfMotionCurves:
         return left
 
     def _crossed(self, left: Array) -> tuple[Indices, Array]:
-        """Steps with xi - xi(q) (S, 2) at their ends along which it passes 0, and where, between 0 and 1."""
+        """Steps along which xi - xi(q), given at both ends (S, 2), crosses 0, and the fraction of the step there."""
         a, b = left.T
         crossed = np.flatnonzero((a * b <= 0) & ~(np.abs(b - a) > self._period / 2))
         a, b = a[crossed], b[crossed]
         return crossed, np.where(a == b, 0.0, a / np.where(a == b, 1.0, a - b))
 
     def _arcs(self, targets: Array, steps: "Steps", left: Array) -> "Arcs":
-        """Points on the steps that may hold a root, an end of an arc, or a place where xi turns back."""
+        """Closely spaced points on the steps that may hold a root, an end of an arc, or a point where xi turns back."""
         steps = steps.part(self._matters(steps, left))
         low, high = self.boxed.domain.bounds
-        # points between, corrected back onto the curve; twice where they may count
+        # divide the steps and correct the points back to the curve, twice if they may lie inside the domain
         q, along = steps.divided()
         slack = RULES.step / RULES.parts
         close = np.asarray(((q >= low - slack) & (q <= high + slack)).all(axis=2))
@@ -277,7 +296,7 @@ class SelfMotionCurves:
         inside, xi_left = np.zeros(close.shape, dtype=bool), np.full(close.shape, np.nan)
         inside[close] = self._contains(points)
         xi_left[close] = self._xi_left(targets[np.repeat(steps.row, close.sum(axis=1))], points)
-        # pieces that may pass a corner of the domain between two points outside
+        # chords between two points outside that may cut through a corner of the box
         passing = close[:, :-1] & close[:, 1:] & ~inside[:, :-1] & ~inside[:, 1:]
         arc, place = np.nonzero(passing)
         first, last = self._shares_inside(q[arc, place], q[arc, place + 1], RULES.sagitta)
@@ -285,20 +304,21 @@ class SelfMotionCurves:
         return Arcs(steps.row, q, inside, passing, xi_left)
 
     def _matters(self, steps: "Steps", left: Array) -> NDArray[np.bool_]:
-        """Steps (S,) that pass the target or a boundary, their neighbours, and those where xi turns back.
+        """Which steps (S,) must be examined at closely spaced points.
 
-        Along the others, xi only moves from one end to the other, and both ends lie in the domain; or they lie outside
+        These are steps along which xi crosses its target, the domain is entered or left, or xi turns back, and their
+        neighbours. On all other steps, either xi is monotonic and both ends lie in the domain, or the step lies outside
         the box. `left` is xi - xi(q) at the ends of the steps, (S, 2).
         """
         inside = np.zeros(steps.q.shape[:2], dtype=bool)
         inside[:, 1] = self._contains(steps.q[:, 1])
-        # where the domain is entered and left; joined steps share their ends
+        # whether the ends of steps lie in the domain; consecutive steps share an end
         begins = np.flatnonzero(~steps.follows)
         inside[begins, 0] = self._contains(steps.q[begins, 0])
         joined = np.flatnonzero(steps.follows)
         inside[joined, 0] = inside[joined - 1, 1]
         both, none = np.asarray(inside.all(axis=1)), np.asarray(~inside.any(axis=1))
-        # steps that change sides, pass a corner, or cross the target
+        # steps with one end inside and one outside, that cut a corner of the box, or that cross the target
         first, last = self._shares_inside(steps.q[:, 0], steps.q[:, 1], RULES.missed)
         changes = np.where(none, first < last, ~both)
         changes[self._crossed(left)[0]] = True
@@ -308,32 +328,35 @@ class SelfMotionCurves:
         # where xi turns back between two steps
         bends = steps.follows.copy()
         bends[1:] &= ~(ahead[1:] * ahead[:-1] > 0) & both[1:] & both[:-1]
-        # and, as a search may begin where it does, at both ends of a curve
+        # also the first and last step of a curve: xi may turn back at its end, where no neighbour shows it
         after = np.append(steps.follows[1:], False)
         changes |= bends | (both & ~(steps.follows & after))
-        # with their neighbours, which bound the root
+        # add neighbours, because a root or turning point may lie just beyond the shared end
         around = changes.copy()
         around[1:] |= changes[:-1] & steps.follows[1:]
         around[:-1] |= changes[1:] & after[:-1]
         return np.asarray(around & ~(none & ~changes))
 
     def _sheets(self, traces: Traces, own: Array) -> tuple[Indices, Array]:
-        """Full turns that bring curves (of K) into the box of the domain: indices of curves (L,), shifts (L, n).
+        """Full turns that bring the K curves into the box of the domain.
 
-        Joints without boundaries turn to within half a turn of the caller's starts (K, n), or one and a half where
-        turns change xi.
+        Joints without boundaries are brought within half a turn of `own` (K, n), or within one and a half turns if
+        their turns change xi.
+
+        Returns:
+            Indices of curves (L,) and shifts (L, n) [rad]; a curve may occur with several shifts.
         """
         low, high = self.boxed.domain.bounds
         turn, room, bounded = 2 * np.pi, RULES.step, np.isfinite(low)
-        # the box, widened by a step; endless joints have turns around their own place
+        # the box, widened by a step; for joints without boundaries an interval around `own`
         low = np.where(bounded, low - room, own - np.where(self.boxed.winding, 3 * np.pi, np.pi))[:, None]
         high = np.where(bounded, high + room, np.inf)
-        # the first full turn that brings each point into it, and where that changes along the curve
+        # the lowest number of turns that brings each point above `low`, and where that number changes along the curve
         first = np.where(self.tracer.turning, np.ceil((low - traces.q) / turn), 0.0)
         at = traces.q + turn * first
         passed = np.ones(at.shape[:2], dtype=bool)
         passed[:, 1:] = (first[:, 1:] != first[:, :-1]).any(axis=2)
-        # further turns that still fit
+        # numbers of additional turns of each joint that still fit
         width = np.where(bounded, (high - low[0, 0]) // turn, np.where(self.boxed.winding, 2, 0))
         choices = [range(1 + int(k)) for k in np.where(self.tracer.turning, width, 0)]
         near = [
@@ -341,7 +364,7 @@ class SelfMotionCurves:
             for j in range(len(high))
         ]
         found = []
-        # each choice of turns: a sheet begins where the curve enters
+        # For each choice of additional turns: list the curve with it wherever the shifted curve enters the box.
         for extra in product(*choices):
             close = np.all([near[j][k] for j, k in enumerate(extra)], axis=0)
             changes = np.asarray(close & passed)
@@ -352,12 +375,16 @@ class SelfMotionCurves:
         return sheets[:, 0].astype(np.int64), turn * sheets[:, 1:]
 
     def _take_solutions(self, targets: Array, rows: Indices, q: Array, tolerance: float, best: Nearest) -> None:
-        """Solutions of phi(q) = phi inside to which Newton's steps lead from points q (K, n) of some rows."""
+        """Take solutions inside the domain into `best` that Newton steps reach from points q (K, n) of rows (K,)."""
         q, solved = self._solve(targets, rows, q, tolerance)
         best.take(rows[solved], q, np.zeros(len(q)))
 
     def _solve(self, targets: Array, rows: Indices, q: Array, tolerance: float) -> tuple[Array, NDArray[np.bool_]]:
-        """The solutions (S, n), and which of the points led to them, (K,)."""
+        """Newton's method from points q (K, n) for the targets of rows (K,).
+
+        Returns:
+            The solutions inside the domain, (S, n), and which of the points led to them, (K,).
+        """
         if not rows.size:
             return q, np.zeros(0, dtype=bool)
         phi_map = self.boxed.phi_map
@@ -365,7 +392,7 @@ class SelfMotionCurves:
             J = phi_map.jacobian(q) / phi_map.sizes[:, None]
             left_over = phi_map.difference(targets[rows], phi_map.phi(q)) / phi_map.sizes
             q = q + solutions_of(J, left_over[:, :, None])[:, :, 0]
-        # points that miss the boundary by rounding, on it
+        # move points that miss the boundary by rounding onto it
         moved = np.clip(q, *self.boxed.domain.bounds)
         near = np.abs(moved - q) <= RULES.snap * self.boxed.domain.half_width
         q = np.where(near.all(axis=1, keepdims=True), moved, q)
@@ -375,14 +402,14 @@ class SelfMotionCurves:
         return q[solved], solved
 
     def _take_points(self, targets: Array, arcs: "Arcs", best: Nearest) -> "Ends":
-        """Take points of arcs that lie in the domain, and return the ends that may be nearer."""
+        """Take points of arcs that lie in the domain into `best`; return ends of arcs that may be nearer."""
         # points inside are candidates for the nearest xi
         inside = arcs.inside & (best.distance > 0)[arcs.row][:, None]
         arc, place = np.nonzero(inside)
         rows, here = arcs.row[arc], arcs.xi_left[arc, place]
         best.take(rows, arcs.q[arc, place], np.abs(here), between=True)
         found = []
-        # an arc may end between a point inside and its neighbour, nearer than both
+        # an arc that ends between a point inside and its neighbour may be nearer at the end than at both
         for side in (-1, 1):
             beyond = np.clip(place + side, 0, inside.shape[1] - 1)
             there = arcs.xi_left[arc, beyond]
@@ -393,7 +420,10 @@ class SelfMotionCurves:
         return found[0].joined(found[1]).joined(self._take_short(targets, arcs, best))
 
     def _take_short(self, targets: Array, arcs: "Arcs", best: Nearest) -> "Ends":
-        """Points and ends of arcs that lie between neighbouring points outside: chords that pass the box are halved."""
+        """Find short arcs between neighbouring points outside, by halving chords that pass through the box.
+
+        Takes points of these arcs into `best`, and returns their ends.
+        """
         arc, place = np.nonzero(arcs.passing & (best.distance > 0)[arcs.row][:, None])
         a, b, rows, found = arcs.q[arc, place], arcs.q[arc, place + 1], arcs.row[arc], Ends.empty(arcs.q.shape[2])
         for level in range(RULES.halvings):
@@ -410,7 +440,7 @@ class SelfMotionCurves:
             best.take(rows[good], q[good], left, between=True)
             for other in (a[good], b[good]):
                 found = found.joined(Ends(rows[good], q[good], other, np.zeros(len(left))))
-            # conditions are not looked at so closely
+            # Halve again only if the middle is outside the box; a middle that violates a condition is given up.
             again = ~good & ~self._in_box(q)
             a, b, rows = (
                 np.concatenate([a[again], q[again]]),
@@ -420,7 +450,12 @@ class SelfMotionCurves:
         return found
 
     def _shares_inside(self, a: Array, b: Array, slack: float) -> tuple[Array, Array]:
-        """Where the chords from a to b (K, n) are in the box, or so near: between shares low and high (K,) if <."""
+        """Intersect chords from a to b (K, n) with the box, widened by `slack`.
+
+        Returns:
+            Fractions (K,) of the chord at which it enters and leaves the box; it misses the box unless the first is
+            less than the second.
+        """
         low, high = self.boxed.domain.bounds
         step = np.where(np.abs(b - a) > 1e-300, b - a, 1e-300)
         one, other = (low - slack - a) / step, (high + slack - a) / step
@@ -428,13 +463,13 @@ class SelfMotionCurves:
         return np.maximum(first, 0.0), np.minimum(last, 1.0)
 
     def _contains(self, q: Array) -> NDArray[np.bool_]:
-        """Which points (N, n) lie in the domain; they need not be finite."""
+        """Whether points (N, n) lie in the domain, (N,); NaN counts as outside."""
         inside = self._in_box(q)
         inside[inside] = self.boxed.domain.contains(q[inside])
         return inside
 
     def _in_box(self, q: Array) -> NDArray[np.bool_]:
-        """Which points (N, n) lie in the box of the domain."""
+        """Whether points (N, n) lie in the box of the domain, (N,)."""
         low, high = self.boxed.domain.bounds
         return np.asarray(((q >= low) & (q <= high)).all(axis=1))
 
@@ -444,7 +479,7 @@ class SelfMotionCurves:
 
     @cached_property
     def has_kernel(self) -> bool:
-        """Whether there is a C compiler; it runs once for a chart."""
+        """Whether the search runs in C; the first call for a chart compiles it."""
         return has_library(self.kernel)
 
     @cached_property
@@ -456,7 +491,7 @@ class SelfMotionCurves:
 
 @dataclass(frozen=True, eq=False)
 class Steps:
-    """S steps of curves around the domain."""
+    """S steps of curves in and near the box of the domain."""
 
     row: Indices  #: number of the target, (S,)
     q: Array  #: both ends, (S, 2, n)
@@ -471,11 +506,11 @@ class Steps:
         return Steps(row, q, tangent, follows)
 
     def point(self, steps: Indices, share: Array) -> Array:
-        """Points of some steps (K,) at shares of the way (K,), on cubic curves, (K, n)."""
+        """Points (K, n) of some steps (K,) at fractions `share` (K,) of the step, on cubic curves."""
         return _on_cubics(self.q[steps], self.tangent[steps], share[:, None])[:, 0]
 
     def divided(self, parts: int = RULES.parts) -> tuple[Array, Array]:
-        """`parts` + 1 points on each step, on cubic curves, and directions there, (S, parts + 1, n) each."""
+        """`parts` + 1 points on each step, on cubic curves, and approximate tangents there, (S, parts + 1, n) each."""
         s = np.broadcast_to(np.arange(parts + 1) / parts, (len(self.q), parts + 1))
         along = (1 - s[:, :, None]) * self.tangent[:, :1] + s[:, :, None] * self.tangent[:, 1:]
         return _on_cubics(self.q, self.tangent, s), along
@@ -483,27 +518,27 @@ class Steps:
 
 @dataclass(frozen=True, eq=False)
 class Arcs:
-    """S steps of curves around the domain, by G points each, close to one another."""
+    """S steps of curves near the domain, each with G closely spaced points. Parts inside the domain are arcs."""
 
     row: Indices  #: number of the target, (S,)
     q: Array  #: (S, G, n)
     inside: NDArray[np.bool_]  #: which points lie in the domain, (S, G)
-    passing: NDArray[np.bool_]  #: whether a chord between neighbours outside passes the box, (S, G - 1)
+    passing: NDArray[np.bool_]  #: whether a chord between neighbours outside passes through the box, (S, G - 1)
     xi_left: Array  #: xi - xi(q), (S, G); NaN far from the domain
 
 
 @dataclass(frozen=True, eq=False)
 class Ends:
-    """Where arcs leave the domain: between neighbouring points of K curves."""
+    """K ends of arcs, each bracketed by neighbouring points inside and outside the domain."""
 
     row: Indices  #: number of the target, (K,)
     inside: Array  #: the last point inside, (K, n)
     outside: Array  #: the point after that, (K, n)
-    least: Array  #: about the least |xi - xi(q)| between them, (K,)
+    least: Array  #: estimate of the least |xi - xi(q)| between them, (K,)
 
     @classmethod
     def empty(cls, n: int) -> "Ends":
-        """None."""
+        """No ends, for n joints."""
         return cls(np.zeros(0, dtype=np.int64), np.zeros((0, n)), np.zeros((0, n)), np.zeros(0))
 
     def joined(self, other: "Ends") -> "Ends":
@@ -513,7 +548,7 @@ class Ends:
 
 
 def _on_cubics(q: Array, t: Array, share: Array) -> Array:
-    """Points on cubic curves with ends q and unit tangents t (K, 2, n), at shares (K, G) of the way, (K, G, n)."""
+    """Points (K, G, n) at fractions `share` (K, G) of cubic curves with ends q and unit tangents t (K, 2, n)."""
     s, step = share[:, :, None], q[:, 1:] - q[:, :1]
     bend = (s - 2 * s**2 + s**3) * t[:, :1] + (s**3 - s**2) * t[:, 1:]
     return np.asarray(q[:, :1] + (3 * s**2 - 2 * s**3) * step + np.linalg.norm(step, axis=2, keepdims=True) * bend)

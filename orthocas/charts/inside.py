@@ -1,4 +1,4 @@
-"""Positions inside the domain that keep the task: with any xi, and, r > 1, with the nearest."""
+"""Positions inside the domain with a given task value: with any xi, and for r > 1 with the nearest xi."""
 
 from dataclasses import dataclass
 from functools import reduce
@@ -18,29 +18,29 @@ from orthocas.tools.checks import Array, Indices
 
 @dataclass(frozen=True, slots=True)
 class SlideRules:
-    """Numbers of the steps. Joints count in half-widths, errors of x in sizes.
+    """Numbers of `slide`. Joint changes are in half-widths, errors of x in component sizes.
 
     Chosen on pr2-left-wide, held on the other ready charts with r > 1 (benchmarks/round_trips.py).
     """
 
-    most: int = 60  #: steps
-    longest: float = 0.7  #: change of a joint in a step
+    most: int = 60  #: largest number of steps
+    longest: float = 0.7  #: largest change of a joint in a step
     shortest: float = 1e-4  #: rows that need shorter steps end
-    bent: float = 3e-3  #: error of x after a step, up to which the step is taken
-    straight: float = 3e-4  #: the same up to which the next step may be longer
-    corrected: float = 20.0  #: times `bent`, up to which a second step with the same J corrects the error of x
-    kept: float = 1e-10  #: error of x that counts as none
-    gains: float = 0.1  #: least decrease of |xi - xi(q)|^2, relative to the promised one
-    foreseen: float = 0.75  #: the same from which the next step may be longer
-    converged: float = 1e-10  #: relative decrease that a minimum may still promise
-    rounded: float = 1e-22  #: squared distance that is rounding
+    bent: float = 3e-3  #: error of x after a step up to which the step is accepted
+    straight: float = 3e-4  #: error of x after a step up to which the next step may be longer
+    corrected: float = 20.0  #: error of x, in units of `bent`, up to which a second step with the same J corrects it
+    kept: float = 1e-10  #: error of x up to which q has the task value
+    gains: float = 0.1  #: least decrease of |xi - xi(q)|^2 for acceptance, relative to the predicted decrease
+    foreseen: float = 0.75  #: relative decrease above which the next step may be longer
+    converged: float = 1e-10  #: predicted decrease, relative to |xi - xi(q)|^2, below which a point is a minimum
+    rounded: float = 1e-22  #: squared distance in xi that is rounding
     least: float = 1e-14  #: decrease that is rounding, relative to 1 + |xi - xi(q)|^2
     still: float = 1e-13  #: change of joints that is rounding
-    aligned: float = 0.95  #: cosine between steps from which their lengths tell how boundaries bend
-    stretch: float = 10.0  #: most that steps get longer or shorter for that
-    penalty: float = 1e5  #: of squared excess of bounds, relative to the squared distance in xi
-    rounds: int = 30  #: guesses which bounds hold
-    room: float = 1e-9  #: to the ends of the conditions of the domain
+    aligned: float = 0.95  #: least cosine between consecutive steps for the Barzilai-Borwein rule
+    stretch: float = 10.0  #: largest factor by which that rule changes the length of a step
+    penalty: float = 1e5  #: weight of squared violations of bounds, relative to the squared distance in xi
+    rounds: int = 30  #: largest number of active sets that a projection tries
+    room: float = 1e-9  #: margin to the conditions of the domain
 
 
 SLIDE = SlideRules()
@@ -48,28 +48,31 @@ SLIDE = SlideRules()
 
 @dataclass(frozen=True, slots=True)
 class InsideRules:
-    """Numbers of the search. Chosen on pr2-left-wide, held on other seeds and charts (benchmarks/round_trips.py)."""
+    """Numbers of `Inside`. Chosen on pr2-left-wide, held on other seeds and charts (benchmarks/round_trips.py).
 
-    starts: int = 8  #: stored positions near x, where no q with x is known inside
-    near_phi: int = 2  #: stored positions near each phi, from which curves are sought on each slice
-    near_x: int = 4  #: the same near each x
-    places: tuple[float, ...] = (-1.0, -0.5, 0.0, 0.5, 1.0)  #: of the first held joint on slices, in half-widths
-    stride: int = 3  #: of the points inside on curves, those taken, from where a curve enters the domain
-    slack: float = 0.1  #: [rad] or [m]: points of curves so far outside the box are moved to its face
-    probes: int = 64  #: positions at which the speeds of joints are measured
-    near: int = 2  #: stored positions near each phi from which slides start
-    short: int = 10  #: points on curves from which slides start
-    steps: int = 4  #: of these slides
-    long: int = 4  #: longer slides from the best of these
-    more: int = 8  #: steps of these slides
-    settled: float = 1e-5  #: error of x up to which their ends are compared
-    last: int = 1  #: slides to the end
-    again: int = 8  #: stored positions near phi, and as many near x, for rows with nothing inside until then
-    descent: int = 16  #: iterations to x from these
-    most: int = 100  #: points nearest to xi, of which those are chosen
-    apart: float = 0.2  #: their least distance from one another, in half-widths
-    nearly: float = 1e-4  #: distance in xi after a short slide from which a long one most probably ends at a solution
-    rows: int = 1024  #: whose points are held in memory
+    A slide is a run of `slide`: steps that keep x and approach xi.
+    """
+
+    starts: int = 8  #: `with_task`: stored positions near x from which rows restart
+    near_phi: int = 2  #: slices: stored positions near each phi at which curves start
+    near_x: int = 4  #: slices: stored positions near each x at which curves start
+    places: tuple[float, ...] = (-1.0, -0.5, 0.0, 0.5, 1.0)  #: slices: values of the first held joint, in half-widths
+    stride: int = 3  #: slices: every so many points of a curve inside the domain are used
+    slack: float = 0.1  #: [rad] or [m] points of curves that far outside the box are moved to its face
+    probes: int = 64  #: positions at which the influence of each joint on x is measured
+    near: int = 2  #: stored positions near each phi at which short slides start
+    short: int = 10  #: points on curves, per row, at which short slides start
+    steps: int = 4  #: steps of short slides
+    long: int = 4  #: long slides per row, from the best ends of short ones
+    more: int = 8  #: steps of long slides
+    settled: float = 1e-5  #: error of x up to which ends of long slides are compared by their distance in xi
+    last: int = 1  #: slides per row that run until they converge, from the best ends of long ones
+    again: int = 8  #: stored positions near phi, and as many near x, for rows without a point inside
+    descent: int = 16  #: iterations of the descents to x from these
+    most: int = 100  #: candidates per row, nearest to xi, from which starts of slides are chosen
+    apart: float = 0.2  #: least distance between the chosen starts, in half-widths
+    nearly: float = 1e-4  #: distance in xi below which a row counts as nearly solved, so that one start is enough
+    rows: int = 1024  #: rows searched at once, to bound memory
 
 
 RULES = InsideRules()
@@ -77,35 +80,35 @@ RULES = InsideRules()
 
 @dataclass(frozen=True, eq=False)
 class Inside:
-    """Finds points of the domain that keep the task."""
+    """Finds points of the domain with a given task value."""
 
     boxed: BoxedPhi
     starts: Starts
 
     def with_task(self, targets: Array, q: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Points of the box with the task values of targets (N, n), or near them, from q (N, n) and other starts.
+        """Points of the box with the task values of targets (N, n), by descent from q (N, n) or stored positions.
 
         Returns:
-            q (N, n), and which of them have the task values, (N,).
+            q (N, n), as near to the task values as the descents come, and whether they are met, (N,).
         """
         u, error = descend(self.boxed, targets, self.boxed.of_points(q), whole=False)
         left = np.flatnonzero(error > DESCENT.kept)
         if left.size:
             points = Points.of(self.starts.nearest(targets[left], RULES.starts, self.boxed.m), self.boxed, left)
             ends, errors = descend(self.boxed, targets[points.row], points.u, whole=False)
-            # what is written last stays
+            # the best last, because the last assignment to a row stays
             farthest_first = np.argsort(-errors, kind="stable")
             better = farthest_first[errors[farthest_first] < error[points.row[farthest_first]]]
             u[points.row[better]], error[points.row[better]] = ends[better], errors[better]
         return self.boxed.points(u), np.asarray(error <= DESCENT.kept)
 
     def nearest(self, targets: Array, q: Array) -> tuple[Array, Array]:
-        """Points of the domain with task values as in targets (N, n), and the nearest xi.
+        """Points of the domain with the task values of targets (N, n) and the nearest xi that is found.
 
-        They are the nearest of those that slides from q (N, n) and from points of slices find.
+        Slides, which keep x and approach xi, start at q (N, n), at stored positions and at points of slices.
 
         Returns:
-            q (N, n), and |xi - xi(q)|, (N,), infinite where none was found.
+            q (N, n), and |xi - xi(q)|, (N,), infinite where no point was found.
         """
         best, distance = q.copy(), np.full(len(q), np.inf)
         for first in range(0, len(q), RULES.rows):
@@ -114,19 +117,19 @@ class Inside:
         return best, distance
 
     def nearer(self, targets: Array, q: Array) -> Array:
-        """Points of the domain as near to xi as those that steps from q (N, n), inside, lead to, (N, n)."""
+        """Refine points q (N, n) of the domain: move along h(q) = x to a local minimum of |xi - xi(q)|, (N, n)."""
         end = slide(self.boxed, targets, self.boxed.of_points(q))
         good = np.isfinite(end.distance) & (end.error <= SLIDE.kept)
         return np.where(good[:, None], self.boxed.points(end.u), q)
 
     def _nearest(self, targets: Array, q: Array) -> tuple[Array, Array]:
-        """`nearest` for few rows: short slides from many points, long ones from the best of their ends."""
+        """`nearest` for few rows: short slides from many points, then long ones from the best of their ends."""
         N, n = q.shape
         near = np.concatenate([q[None], self.starts.nearest(targets, RULES.near, n)])
         ends = self._slid(targets, self._turned(targets, Points.of(near, self.boxed), q), RULES.steps)
         left, bare = np.flatnonzero(ends.best(N)[1] > RULES.nearly), np.zeros(0, dtype=np.int64)
         if left.size:
-            # points after full turns, and about how far joints have to move from there to xi
+            # points of slices after the best full turns, ranked by how far the joints would have to move to reach xi
             points = self._slice(targets, q, left)
             points = self._turned(targets, points, q)
             J = self.boxed.phi_map.jacobian(self.boxed.points(points.u)) * self.boxed.domain.half_width
@@ -147,12 +150,12 @@ class Inside:
         return self.boxed.points(u), distance
 
     def _to_end(self, targets: Array, ends: "Points", N: int) -> "Points":
-        """Where long slides from the best of some ends, and slides to the end from the best of those, keep x."""
+        """Continue from the best ends: long slides, then converged ones; return the ends inside that have x."""
         ends = self._slid(targets, ends.apart(N, RULES.long), RULES.more)
         return ends.joined(self._slid(targets, ends.apart(N, RULES.last, RULES.settled), SLIDE.most)).kept()
 
     def _again(self, targets: Array, q: Array, left: Indices) -> "Points":
-        """Stored positions for some rows, and points inside to which descents from these lead."""
+        """Starts for rows in which nothing was found: q, stored positions, and points with x to which these descend."""
         if not left.size:
             return Points.of(q[None, left], self.boxed)
         components = q.shape[1], self.boxed.m
@@ -163,42 +166,43 @@ class Inside:
         return points.joined(Points(points.row[kept], u[kept], *np.zeros((2, kept.sum()))))
 
     def _slid(self, targets: Array, points: "Points", most: int) -> "Points":
-        """Where slides from points end."""
+        """The ends of slides of at most `most` steps from the given points."""
         end = slide(self.boxed, targets[points.row], points.u, most)
         return Points(points.row, end.u, end.distance, end.error)
 
     def _turned(self, targets: Array, points: "Points", q: Array) -> "Points":
-        """Points after the full turns near those of q (N, n) that bring xi nearest to targets (N, n)."""
+        """Turn joints by full turns so that xi comes nearest to targets (N, n), within 1.5 turns of q (N, n)."""
         boxed = self.boxed
-        # choices of turns (T, n) of joints whose turn adds the same to xi at all positions, and what they add, (T, r)
+        # joints whose full turn adds the same to xi everywhere: all combinations of -1, 0, 1 turns (T, n), and what
+        # they add, (T, r)
         winds, turn = boxed.winding & boxed.even, 2 * np.pi / boxed.domain.half_width
         turns = np.array(list(product(*((-1.0, 0.0, 1.0) if joint else (0.0,) for joint in winds))))
         shifts = turns @ np.where(winds[:, None], boxed.turned[0], 0.0)
-        # u within half a turn of that of q, then turned by the best choice
+        # first bring these joints within half a turn of q, then choose the best combination
         u = points.u - np.where(winds, turn * np.round((points.u - boxed.of_points(q)[points.row]) / turn), 0.0)
         away = np.linalg.norm(boxed.xi_gaps(targets[points.row], boxed.points(u))[:, None] - shifts, axis=2)
         return Points(points.row, u + turn * turns[np.argmin(away, axis=1)], away.min(axis=1), points.error)
 
     def _slice(self, targets: Array, own: Array, rows: Indices) -> "Points":
-        """Points of the domain with x nearly as in some rows of targets (N, n), on curves.
+        """Points of the domain with x nearly as in some rows of targets (N, n), on slices.
 
-        Where r - 1 joints are held, all positions of a regular x form closed curves, as they do for r = 1. The held
-        joints are those that move x least over their ranges: the first of them at its boundaries and between, the
-        others where stored positions near x have them. So the curves pass through most of the regions that positions
-        with x form.
+        On a slice, r - 1 joints are held. Then the positions with a regular x form closed curves, as they do for r = 1.
+        The held joints are those that move x least over their ranges. The first of them is held at five values across
+        its range, the others at their values in stored positions near x. So the curves pass through most of the
+        connected regions of positions with x.
 
-        Joints are turned towards given positions (N, n), where they can turn more than once; those without boundaries
-        whose turns change xi unevenly towards the centre of the domain, and once more to both sides.
+        Joints that can turn by more than one turn are placed near `own` (N, n). Joints without boundaries whose turns
+        change xi by different amounts are placed near the centre of the domain, and one turn to both sides of it.
         """
         domain, (low, high), turning = self.boxed.domain, self.boxed.domain.bounds, self._tracer.turning
-        # of endless joints whose turns change xi unevenly, the turns on both sides as well
+        # joints without boundaries whose turns change xi unevenly: also try one turn to both sides
         uneven = turning & ~np.isfinite(low) & ~self.boxed.even
         several = ~uneven & ((domain.half_width > np.pi) | ~np.isfinite(low))
         turns = 2 * np.pi * np.array(list(product(*((-1, 0, 1) if more else (0,) for more in uneven))))
         found = [Points.of(own[:0, None], self.boxed)]
         with np.errstate(all="ignore"):
             for traces in self._curves(targets[rows]):
-                # points of the curves, moved by full turns next to where the row is, then into the box
+                # points of the curves, shifted by full turns near the row's position, then into the box
                 curve, place = np.nonzero(np.arange(traces.q.shape[1]) < traces.count[:, None])
                 row, q = rows[traces.row[curve] // len(RULES.places)], traces.q[curve, place]
                 towards = np.where(several, own[row], domain.centre)
@@ -207,7 +211,7 @@ class Inside:
                 q = turns[:, None] + q + np.where(turning, 2 * np.pi * back, 0.0)
                 inside = np.asarray(((q >= low - RULES.slack) & (q <= high + RULES.slack)).all(axis=2))
                 number = np.arange(inside.size).reshape(inside.shape)
-                # of points inside, every few from where a curve enters
+                # keep every `stride`-th point inside, counted from where the curve enters the domain
                 enters = inside & ~np.roll(inside, 1, axis=1)
                 inside &= (number - np.maximum.accumulate(np.where(enters, number, 0), axis=1)) % RULES.stride == 0
                 inside[inside] = domain.contains(np.clip(q[inside], low, high))
@@ -215,9 +219,9 @@ class Inside:
         return reduce(Points.joined, found)
 
     def _curves(self, targets: Array) -> list[Traces]:
-        """Curves of all slices; number k of K of target j is row K j + k."""
+        """Trace the curves of all slices. Slice k of the K slices of target j has the row number K j + k."""
         m, n, K = self.boxed.m, targets.shape[1], len(RULES.places)
-        # stored positions near each target, put onto each slice
+        # starts: stored positions near each target, with the held joints moved onto each slice
         near = self.starts.nearest(targets, RULES.near_phi, n), self.starts.nearest(targets, RULES.near_x, m)
         start = np.repeat(np.concatenate(near).transpose(1, 0, 2), K, axis=0)
         held, domain = list(self._tracer.held), self.boxed.domain
@@ -226,7 +230,7 @@ class Inside:
         x = np.concatenate(
             [np.repeat(targets[:, :m], K, axis=0)[:, None].repeat(start.shape[1], axis=1), start[:, :, held]], axis=2
         )
-        # from there to x, and along the curves; starts on known curves are done
+        # move the starts to x, then trace curves until every start lies on one
         q, arrived = self._tracer.reach(x.reshape(-1, n - 1), start.reshape(-1, n))
         q, known, found = q.reshape(start.shape), ~arrived.reshape(start.shape[:2]), []
         away = self._tracer.away(q)
@@ -241,7 +245,7 @@ class Inside:
 
     @cached_property
     def _tracer(self) -> CurveTracer:
-        """Traces the curves of slices."""
+        """The curve tracer of slices; it holds the r - 1 joints that move x least over their ranges."""
         q = sample_uniform(self.boxed.domain, RULES.probes, 0)
         J = self.boxed.phi_map.jacobian(q)[:, : self.boxed.m] / self.boxed.phi_map.sizes[: self.boxed.m, None]
         reach = np.nanmean(np.linalg.norm(J, axis=1), axis=0) * self.boxed.domain.half_width
@@ -250,25 +254,28 @@ class Inside:
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """P points of the box, of any rows."""
+    """P candidate points of the box, each for one row; a row may have many."""
 
-    row: Indices  #: (P,)
-    u: Array  #: (P, n)
-    away: Array  #: |xi - xi(q)|, or what points are chosen by, (P,); infinite outside the domain
+    row: Indices  #: number of the row, (P,)
+    u: Array  #: q in half-widths from the centre, (P, n)
+    away: Array  #: |xi - xi(q)|, or another cost by which points are ranked, (P,); infinite outside the domain
     error: Array  #: largest error of x, (P,)
 
     @classmethod
     def of(cls, q: Array, boxed: BoxedPhi, rows: Indices | None = None) -> "Points":
-        """S positions of each of N rows, q (S, N, n), which may be some of more rows."""
+        """Points from S positions for each of N rows, q (S, N, n). `rows` (N,) are the row numbers, default 0 to N - 1.
+
+        `away` and `error` are not known yet: NaN.
+        """
         row = np.tile(np.arange(q.shape[1]) if rows is None else rows, len(q))
         return cls(row, boxed.of_points(q.reshape(-1, q.shape[2])), *np.full((2, len(row)), np.nan))
 
     def part(self, which: NDArray[np.bool_] | Indices) -> "Points":
-        """Some of them."""
+        """The selected points."""
         return Points(*(array[which] for array in vars(self).values()))
 
     def kept(self) -> "Points":
-        """Points inside that have x."""
+        """The points inside the domain that have x."""
         return self.part((self.error <= SLIDE.kept) & np.isfinite(self.away))
 
     def joined(self, other: "Points") -> "Points":
@@ -276,20 +283,25 @@ class Points:
         return Points(*(np.concatenate(pair) for pair in zip(vars(self).values(), vars(other).values(), strict=True)))
 
     def best(self, N: int) -> tuple[Indices, Array]:
-        """Which point with nearly x is the nearest of each of N rows, and how near it is, (N,); infinite for none."""
+        """The best point of each of N rows among those with an error of x up to `SLIDE.bent`.
+
+        Returns:
+            Indices of the points, (N,), and their `away`, (N,); infinite for rows without such a point.
+        """
         away = np.where(self.error <= SLIDE.bent, self.away, np.inf)
         order, distance = np.argsort(-away, kind="stable"), np.full(N, np.inf)
         place = np.zeros(N, dtype=np.int64)
-        # what is written last stays
+        # nearest last, because the last assignment to a row stays
         place[self.row[order]], distance[self.row[order]] = order, away[order]
         return place, distance
 
     def apart(self, N: int, count: int, settled: float = SLIDE.bent) -> "Points":
-        """Up to so many of the best points of each of N rows that lie apart; one alone of rows nearly solved.
+        """Choose up to `count` of the best points of each of N rows, at least `RULES.apart` from one another.
 
-        Points with errors of x up to `settled` come first, then those with the least distance.
+        Points with errors of x up to `settled` come first; among them, those with the least `away`. A row that is
+        nearly solved gets one point.
         """
-        # the best of each row first, up to a number of them
+        # sort the points of each row, and keep at most `RULES.most`
         order = np.lexsort((self.away, self.error > settled, self.row))
         order = order[np.isfinite(self.away[order])]
         if not order.size:
@@ -299,7 +311,7 @@ class Points:
         order, row, rank = (array[rank < RULES.most] for array in (order, row, rank))
         place = np.full((N, RULES.most), -1)
         place[row, rank] = order
-        # take the best that is left, and drop what lies near it
+        # take the best remaining point of each row, and drop the points near it
         u, left, chosen = self.u[place], place >= 0, [np.zeros(0, dtype=np.int64)]
         for _ in range(count):
             first = np.argmax(left, axis=1)
@@ -309,14 +321,14 @@ class Points:
             best = place[rows, first[rows]]
             chosen.append(best)
             left[rows] &= np.abs(u[rows] - self.u[best][:, None]).max(axis=2) >= RULES.apart
-            # a row that is nearly solved needs no other point
+            # a nearly solved row needs no other point
             left[rows[(self.away[best] <= RULES.nearly) & (self.error[best] <= settled)]] = False
         return self.part(np.concatenate(chosen))
 
 
 @dataclass(frozen=True, eq=False)
 class Slide:
-    """The points at which the searches of N rows ended."""
+    """The points at which the slides of N rows ended."""
 
     u: Array  #: points of the box, (N, n)
     error: Array  #: largest error of x, (N,)
@@ -324,18 +336,19 @@ class Slide:
 
 
 def slide(boxed: BoxedPhi, targets: Array, start: Array, most: int = SLIDE.most) -> Slide:
-    """Points u of the domain near a start with x as in targets, and |xi - xi(q)| as small as steps make it.
+    """Minimise |xi - xi(q)| subject to h(q) = x and q in the domain, from a start, for N targets at once.
 
-    With J^-1 = [P, B], P for x and B for xi, all d = P (x - h(q)) + B z lead to x to first order, and change xi by z.
-    A step is that with the z nearest to xi - xi(q) for which q + d lies in the domain: the projection of a point on a
-    polytope of r dimensions. A second step with the same J corrects the error of x; what remains must be small, and
-    the distance has to decrease as promised. Otherwise steps get shorter.
+    Let J^-1 = [P, B] with the columns P for x and B for xi. To first order, every step d = P (x - h(q)) + B z leads to
+    x and changes xi by z. The step uses the z nearest to xi - xi(q) for which q + d lies in the domain, the projection
+    of a point onto a polytope in r dimensions. A second step with the same J corrects the error of x. A step is
+    accepted if the remaining error of x is small and the distance decreases about as predicted. Otherwise the next step
+    is shorter.
 
     Args:
         boxed: phi and the domain.
         targets: values of phi, (N, n).
-        start: points of the box, (N, n); they need not have x.
-        most: steps.
+        start: points u of the box, (N, n); they need not have x.
+        most: largest number of steps.
 
     Source:
         Sequential quadratic programming in coordinates where both equations are linear; ours.
@@ -343,7 +356,7 @@ def slide(boxed: BoxedPhi, targets: Array, start: Array, most: int = SLIDE.most)
     with np.errstate(all="ignore"):
         run = _Run(boxed, targets, start)
         rows = np.flatnonzero(np.isfinite(run.gap).all(axis=1))
-        # all rows at once; each ends where its steps gain nothing
+        # all rows at once; a row ends when its steps gain nothing
         for _ in range(most):
             if not rows.size:
                 break
@@ -353,7 +366,7 @@ def slide(boxed: BoxedPhi, targets: Array, start: Array, most: int = SLIDE.most)
 
 
 class _Run:
-    """The state of all rows."""
+    """The state of `slide` for all rows."""
 
     def __init__(self, boxed: BoxedPhi, targets: Array, start: Array) -> None:
         self._boxed, self._targets = boxed, targets
@@ -361,15 +374,15 @@ class _Run:
         self.u = start.copy()
         self.gap = self._gaps(np.arange(len(start)), start)  #: phi - phi(q), x relative to sizes, (N, n)
         self._longest = np.full(len(start), SLIDE.longest)
-        # the last z, as projected and as taken
+        # the last z of each row, before and after it was stretched and cut
         self._before = np.zeros((len(start), 2, start.shape[1] - boxed.m))
-        # which bounds the last steps held
+        # active bounds of the last step: -1 low, 1 high, 0 inactive
         self._held = np.zeros(start.shape, dtype=np.int8)
-        # rows that met the end of a condition
+        # whether a row has met a condition of the domain, so that its steps must respect it
         self._meets = np.zeros(len(start), dtype=bool)
 
     def advance(self, rows: Indices) -> Indices:
-        """Try a step in some rows; returns those that go on."""
+        """Try a step in the given rows; return the rows that are not finished."""
         boxed, m, gap, u = self._boxed, self._boxed.m, self.gap[rows], self.u[rows]
         J = boxed.phi_map.jacobian(boxed.points(u)) * boxed.domain.half_width / self._sizes[:, None]
         H = inverses(J)[0]
@@ -378,20 +391,20 @@ class _Run:
         longest, walls = self._longest[rows, None], self._walls(rows, u)
         back = _times(P, gap[:, :m])
         wanted = left * np.minimum(1.0, longest / _size(_times(B, left)))
-        # the step of xi that the boundaries allow, after the step back to x
+        # the largest part of the desired change of xi that the boundaries allow, after the step back to x
         z, held = walls.project(B, back, wanted, self._held[rows])
         stretch, plain = self._stretches(rows, z), z
-        # longer where several steps went the same way
+        # stretch steps that continue in the direction of the last one
         some = np.flatnonzero(stretch != 1)
         if some.size:
             z = z.copy()
             z[some] = walls.part(some).project(B[some], back[some], stretch[some, None] * z[some], held[some])[0]
         d = back + _times(B, z)
-        # cut to the trust region, and corrected once
+        # cut the step to the trust region, and correct the error of x once
         part = np.minimum(1.0, longest / _size(d))
         d, z = np.clip(part * d, boxed.low - u, boxed.high - u), part * z
         new, after = self._corrected(rows, u + d, P, B, walls.slopes, held)
-        # accept if x stays near and xi comes nearer, about as the linear model promised
+        # accept if x stays near and |xi - xi(q)|^2 decreases about as the linear model predicts
         error, before = largest(after[:, :m]), largest(gap[:, :m])
         square = (left**2).sum(axis=1)
         promised = 2 * (left * z).sum(axis=1) - (z**2).sum(axis=1) / stretch
@@ -402,7 +415,7 @@ class _Run:
             | (before > SLIDE.bent)
             | ((before > SLIDE.kept) & (error < before / 2))
         )
-        # points outside the domain: from now on, the row sees its condition as a wall
+        # If the new point violates a condition of the domain, the row treats the condition as a bound from now on.
         inside = good.copy()
         inside[good] = boxed.domain.contains(boxed.points(new[good]))
         met = good & ~inside & ~self._meets[rows] & boxed.has_rooms
@@ -411,20 +424,20 @@ class _Run:
         self.u[moved], self.gap[moved] = new[inside], after[inside]
         self._held[rows] = held[:, : u.shape[1]]
         self._before[moved] = np.stack([plain, z], axis=1)[inside]
-        # the trust region grows where the model was right
+        # the trust region grows if the model was right
         foreseen = (error < SLIDE.straight) | (gain > promised - (1 - SLIDE.foreseen) * size)
         longer = np.where(foreseen, np.minimum(2 * longest[:, 0], SLIDE.longest), longest[:, 0])
         shorter = np.minimum(longest[:, 0], np.abs(d).max(axis=1)) / 3
         self._longest[rows] = np.where(inside, longer, np.where(met, longest[:, 0], shorter))
-        # where nothing is promised any more
+        # a row ends if its step predicts no further decrease, or moves no joint
         ended = (size <= SLIDE.converged * square + SLIDE.rounded) | (np.abs(d).max(axis=1) <= SLIDE.still)
         ended &= (before <= SLIDE.kept) & ~met
         return np.asarray(rows[~ended & (self._longest[rows] > SLIDE.shortest)])
 
     def _stretches(self, rows: Indices, z: Array) -> Array:
-        """How much longer steps z (rows, r) should be, or shorter, where boundaries bend: Barzilai and Borwein's rule.
+        """Factors (rows,) for the lengths of steps z (rows, r), by Barzilai and Borwein's rule.
 
-        Only where the last step went the same way.
+        They account for curved boundaries. The factor is 1 unless the last step had nearly the same direction.
         """
         plain, taken = self._before[rows].swapaxes(0, 1)
         along, size = (taken * z).sum(axis=1), (taken**2).sum(axis=1)
@@ -436,14 +449,17 @@ class _Run:
     def _corrected(
         self, rows: Indices, new: Array, P: Array, B: Array, slopes: Array, held: NDArray[np.int8]
     ) -> tuple[Array, Array]:
-        """Points after a second step to x, and into the domain, and what is left of phi there, (rows, n) each.
+        """Correct the error of x at new points (rows, n) by a second step with the same J that respects the boundaries.
 
-        Only where x is nearer after it. Conditions bend, so they are evaluated again.
+        A correction counts only if it reduces the error of x. Conditions are curved, so they are evaluated again.
+
+        Returns:
+            The points u, and phi - phi(q) there, (rows, n) each.
         """
         m, boxed = self._boxed.m, self._boxed
         after = self._gaps(rows, new)
         error = largest(after[:, :m])
-        # rows that missed x by little, and those at a condition, take one more Newton step
+        # rows with a small error of x, and rows at a condition, take the second step
         some = np.flatnonzero(((error > SLIDE.kept) | self._meets[rows]) & (error < SLIDE.corrected * SLIDE.bent))
         if some.size:
             back, walls = _times(P[some], after[some, :m]), self._walls(rows[some], new[some], slopes[some])
@@ -455,10 +471,13 @@ class _Run:
         return new, after
 
     def _walls(self, rows: Indices, u: Array, slopes: Array | None = None) -> "Walls":
-        """The boundaries as seen from points u of some rows; the slopes of conditions may be those of other points."""
+        """Bounds of steps from points u of some rows: the box and the linearised conditions of the domain.
+
+        `slopes` are the gradients of the conditions; default: those at u.
+        """
         boxed = self._boxed
         low, high = boxed.low - u, boxed.high - u
-        # conditions count only in rows that met one
+        # conditions bound only rows that have met one
         meets = np.flatnonzero(self._meets[rows])
         if not meets.size:
             return Walls(low, high, np.zeros((len(rows), 0, u.shape[1])))
@@ -471,7 +490,7 @@ class _Run:
         return Walls(np.hstack([low, -rooms]), np.hstack([high, np.full_like(rooms, np.inf)]), slopes)
 
     def _gaps(self, rows: Indices, u: Array) -> Array:
-        """phi - phi(q), x relative to sizes, (rows, n)."""
+        """phi - phi(q), (rows, n), with x relative to the component sizes."""
         gaps: Array = self._boxed.gaps(self._targets[rows], u) / self._sizes
         return gaps
 
@@ -485,13 +504,13 @@ class Walls:
     slopes: Array  #: of the conditions, (N, k, n)
 
     def part(self, rows: Indices) -> "Walls":
-        """Points of some rows."""
+        """The bounds of some rows."""
         return Walls(self.low[rows], self.high[rows], self.slopes[rows])
 
     def project(self, B: Array, back: Array, wanted: Array, held: NDArray[np.int8]) -> tuple[Array, NDArray[np.int8]]:
-        """The z (N, r) nearest to wanted ones for which d = back + B z keeps the bounds, as far as any z does.
+        """The z (N, r) nearest to `wanted` for which d = back + B z respects the bounds, as far as any z does.
 
-        From a guess which of the first bounds hold; returns those that do, (N, n + k).
+        `held` is a guess of the active bounds, for the first columns. The active bounds (N, n + k) are returned, too.
         """
         guess = np.zeros(self.low.shape, dtype=np.int8)
         shared = min(self.low.shape[1], held.shape[1])
@@ -502,20 +521,21 @@ class Walls:
 
 
 def project(B: Array, low: Array, high: Array, wanted: Array, held: NDArray[np.int8]) -> tuple[Array, NDArray[np.int8]]:
-    """The points z (N, r) of polytopes low <= B z <= high that are nearest to wanted ones (N, r).
+    """The points z (N, r) of polytopes low <= B z <= high that are nearest to `wanted` (N, r).
 
-    Bounds that z breaks are penalised; which they are is guessed again and again until that does not change. Two
-    steps of their multipliers then make z exact. Where a polytope is empty, z breaks its bounds as little as it can.
+    Violated bounds are penalised: each round solves with the bounds that the last z violated, until these no longer
+    change. Two multiplier steps (augmented Lagrangian) then make z exact. If a polytope is empty, z violates its bounds
+    as little as possible.
 
     Args:
         B: (N, k, r).
         low: (N, k).
         high: (N, k).
         wanted: (N, r).
-        held: a guess which bounds hold, -1 low, 1 high, (N, k).
+        held: a guess of the active bounds: -1 low, 1 high, 0 inactive, (N, k).
 
     Returns:
-        z, and the bounds that hold, (N, k).
+        z, and the active bounds, (N, k).
     """
     z, held, left = wanted.copy(), held.copy(), np.arange(len(wanted))
     solve = np.flatnonzero(held.any(axis=1))
@@ -527,7 +547,7 @@ def project(B: Array, low: Array, high: Array, wanted: Array, held: NDArray[np.i
         values = _times(B[left], z[left])
         now = (values > high[left]) * 1 - (values < low[left]) * 1
         changes = now != held[left]
-        # the first bound alone, so that they do not change back and forth
+        # later change only the first bound in each round, so that the active set does not cycle
         if k >= SLIDE.rounds // 6:
             changes &= np.cumsum(changes, axis=1) == 1
         some = changes.any(axis=1)
@@ -545,7 +565,10 @@ def project(B: Array, low: Array, high: Array, wanted: Array, held: NDArray[np.i
 
 
 def _penalised(B: Array, low: Array, high: Array, held: NDArray[np.int8]) -> tuple[Array, Array, Array]:
-    """Rows of B (N, k, r) and bounds (N, k) that are held, 0 elsewhere, and 1 + penalty B^T B of these, (N, r, r)."""
+    """Active rows A of B (N, k, r) and their bounds (N, k), both 0 for inactive ones, and I + penalty A^T A, (N, r, r).
+
+    A small ridge keeps the last matrix positive definite in rounding.
+    """
     A = B * (held != 0)[:, :, None]
     bounds = np.where(held > 0, high, np.where(held < 0, low, 0.0))
     K = SLIDE.penalty * (A.transpose(0, 2, 1) @ A)
@@ -554,11 +577,11 @@ def _penalised(B: Array, low: Array, high: Array, held: NDArray[np.int8]) -> tup
 
 
 def _times(matrices: Array, vectors: Array) -> Array:
-    """Products of matrices (N, i, j) and vectors (N, j), (N, i)."""
+    """Products (N, i) of matrices (N, i, j) and vectors (N, j)."""
     products: Array = (matrices @ vectors[:, :, None])[:, :, 0]
     return products
 
 
 def _size(steps: Array) -> Array:
-    """Largest change of a joint, (N, 1)."""
+    """Largest change of a joint in steps (N, n), (N, 1); at least 1e-300."""
     return np.asarray(np.maximum(np.abs(steps).max(axis=1, keepdims=True), 1e-300))
