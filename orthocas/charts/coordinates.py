@@ -24,7 +24,7 @@ from orthocas.tools.checks import Array, freeze_array, require_shape
 from orthocas.tools.columns import COLUMNS, MANY, BlockedFunction, BlockFunction, ColumnFunction, fill
 from orthocas.tools.expressions import expand_scalars
 
-_FEW = 8  # joint positions below which networks are evaluated one by one
+_FEW = 8  # smaller sets of joint positions are evaluated one by one by networks
 
 
 class CoordinateMap(Protocol):
@@ -47,9 +47,9 @@ class CoordinateMap(Protocol):
 
     @property
     def functions(self) -> dict[str, ca.Function]:
-        """CasADi functions of one joint position (n, 1), as graphs of shared parts.
+        """CasADi functions of one joint position (n, 1), by name.
 
-        They are xi (r, 1), jacobian (r, n), and second_derivative (r, 1) of q, v, w: (d/ds) J_xi(q + s v) w.
+        They are xi (r, 1), jacobian (r, n), and second_derivative (r, 1) of q, v, w: (d/ds) J_xi(q + s v) w at s = 0.
         """
         ...
 
@@ -72,15 +72,15 @@ class InvertibleMap(Protocol):
         ...
 
     def inverse(self, phi: Array, q_start: Array) -> Array:
-        """Joint positions (N, n) with the given task values and coordinates phi (N, n); NaN where there are none."""
+        """Joint positions (N, n) with task values and coordinates phi (N, n), from q_start (N, n); NaN if none."""
         ...
 
 
 def point_functions(family: Family, theta: Array, n: int) -> dict[str, ca.Function]:
-    """xi (r, 1) and jacobian (r, n) as functions of q (n, 1); second_derivative (r, 1) as a function of q, v, w.
+    """CasADi functions of a family: xi (r, 1) and jacobian (r, n) of q (n, 1), and second_derivative (r, 1) of q, v, w.
 
-    second_derivative is d^2 xi(q)[v, w]. A basis is evaluated once, and a loop multiplies it with a table of
-    coefficients: written out, a polynomial of degree 4 on seven joints takes ten thousand operations.
+    second_derivative is d^2 xi(q)[v, w]. For linear families, the basis is evaluated once and multiplied by the matrix
+    of coefficients in a loop. As scalar code, a polynomial of degree 4 on seven joints would take 10,000 operations.
     """
     if isinstance(family, SelfDerivativeFamily):
         return _from_tables(family, theta, n)
@@ -96,7 +96,7 @@ def point_functions(family: Family, theta: Array, n: int) -> dict[str, ca.Functi
         return _functions(C @ basis(q), C @ slopes(q), C @ bends(q, v, w), q, v, w)
     kind: Any = ca.MX if family.as_matrices else ca.SX
     q, v, w = (kind.sym(name, n) for name in ("q", "v", "w"))
-    # constants, so that weights are not sliced and transposed at every call
+    # weights are constants of the graph, so that calls do not slice and transpose them
     parameters: Any = ca.DM(theta)
     xi = family.expression(q, parameters)
     jacobian = ca.horzcat(*family.jacobian(q, parameters)).T
@@ -104,18 +104,19 @@ def point_functions(family: Family, theta: Array, n: int) -> dict[str, ca.Functi
 
 
 def second_derivative(values: Any, q: Any, v: Any, w: Any) -> Any:
-    """(d/ds) J(q + s v) w of an SX or MX expression."""
+    """(d/ds) J(q + s v) w at s = 0, with the Jacobian J of an SX or MX expression `values` in q."""
     return ca.jtimes(ca.jtimes(values, q, w), q, v)
 
 
 def _from_tables(family: SelfDerivativeFamily, theta: Array, n: int) -> dict[str, ca.Function]:
-    """Functions of a family whose basis is closed under differentiation: d xi / d q_i = C_i psi', psi' part of psi.
+    """`point_functions` for a family whose basis psi is closed under differentiation: d xi / d q_i = C_i psi'.
 
-    For a polynomial of degree d, psi' holds the terms up to degree d - 1, and J is one table times psi'.
+    psi' is the part of [1; psi] that occurs in derivatives: for a polynomial of degree d, the terms up to degree d - 1.
+    So J is one matrix of coefficients times psi'.
     """
     r = family.outputs
     tables = family.derivative_tables(theta)
-    # psi' holds the terms that occur in derivatives
+    # the terms of psi' are those with a coefficient in any derivative
     places = np.flatnonzero(tables.any(axis=(0, 1)))
     x, u = ca.SX.sym("q", n), ca.SX.sym("v", n)
     psi = family.basis(x)
@@ -123,7 +124,7 @@ def _from_tables(family: SelfDerivativeFamily, theta: Array, n: int) -> dict[str
     basis = ca.Function("basis", [x], [psi])
     smaller_basis = ca.Function("smaller_basis", [x], [smaller])
     change = ca.Function("smaller_basis_change", [x, u], [ca.densify(ca.jtimes(smaller, x, u))])
-    # coefficients as matrices, so that products are loops in C
+    # coefficients are MX matrices, so that generated C multiplies in loops
     values = ca.MX(ca.DM(theta.reshape(r, family.width)))
     slopes = ca.MX(ca.DM(tables[:, :, places].reshape(n * r, len(places))))
     q, v, w = (ca.MX.sym(name, n) for name in ("q", "v", "w"))
@@ -133,6 +134,7 @@ def _from_tables(family: SelfDerivativeFamily, theta: Array, n: int) -> dict[str
 
 
 def _functions(xi: Any, jacobian: Any, second: Any, q: Any, v: Any, w: Any) -> dict[str, ca.Function]:
+    """Dense CasADi functions of expressions in q, v, w, by name."""
     return {
         "xi": dense_function("xi", [q], [xi]),
         "jacobian": dense_function("J_xi", [q], [jacobian]),
@@ -140,13 +142,13 @@ def _functions(xi: Any, jacobian: Any, second: Any, q: Any, v: Any, w: Any) -> d
     }
 
 
-Maker = Callable[[], BlockFunction]  #: makes a function of many joint positions side by side, once for each thread
+Maker = Callable[[], BlockFunction]  #: builds a function of a block of joint positions (n, c); one for each thread
 
 
 def _values(coordinates: "Coordinates", family: SelfDerivativeFamily) -> Maker:
-    """What makes xi = scale (C psi - offset), and the idle joints: a function of q (n, c) that returns (r, c)."""
+    """Maker of the function q (n, c) -> xi (r, c) on blocks: scale (C psi - offset), then the idle joints."""
     r, active, idle = family.outputs, coordinates.active, list(coordinates.idle)
-    # scale and offset go into the coefficients
+    # scale and offset are applied to the coefficients once
     C = coordinates.scale[:, None] * coordinates.theta.reshape(r, -1)
     shift, centre = (coordinates.scale * coordinates.offset)[:, None], coordinates.space.centre[idle, None]
     q = ca.SX.sym("q", len(active))
@@ -167,15 +169,18 @@ def _values(coordinates: "Coordinates", family: SelfDerivativeFamily) -> Maker:
 
 
 def _slopes(coordinates: "Coordinates", family: SelfDerivativeFamily) -> Maker:
-    """The same for J_xi row by row, (r n, c): scale C_i psi', psi' as in `_from_tables`, and 1 for idle joints."""
+    """Maker of the function q (n, c) -> J_xi (r n, c) on blocks, row by row.
+
+    The entries of fitted coordinates are scale C_i psi' (see `_from_tables`); idle joints have rows of the identity.
+    """
     n, r, active = coordinates.space.n, family.outputs, coordinates.active
     by_joint = family.derivative_tables(coordinates.theta)  # (active, r, 1 + K)
-    # one table for all joints, with scales and only the functions that occur
+    # one table for all joints, with the scales, and only the terms that occur
     places = np.flatnonzero(by_joint.any(axis=(0, 1)))
     table = np.zeros((r, n, len(places)))
     table[:, active] = coordinates.scale[:, None, None] * by_joint[:, :, places].transpose(1, 0, 2)
     flat = table.reshape(r * n, len(places))
-    # gradients of idle joints never change
+    # gradients of idle joints are constant
     of_idle = np.eye(n)[list(coordinates.idle)].reshape(-1, 1)
     q = ca.SX.sym("q", len(active))
     smaller = ca.vertcat(1, family.basis(q))[places.tolist()]
@@ -198,8 +203,8 @@ def _slopes(coordinates: "Coordinates", family: SelfDerivativeFamily) -> Maker:
 class Coordinates:
     """xi(q) = [scale (family(q_active) - offset); q_idle - centre_idle], (r, 1).
 
-    Offset and scale are chosen so that xi(centre) = 0, and the mean gradient length of each coordinate over the domain
-    is 1. They do not change any angles.
+    Fits choose offset and scale so that xi(centre) = 0, and so that the mean gradient length of each coordinate over
+    the domain is 1. They do not change any angles.
     """
 
     parametrisation: Parametrisation
@@ -211,7 +216,7 @@ class Coordinates:
 
     def __post_init__(self) -> None:
         fitted = len(self.offset)
-        # before a basis is built that may be enormous
+        # check theta before the basis is built, because a wrong degree could make the basis enormous
         if isinstance(self.parametrisation, GradedParametrisation):
             terms = self.parametrisation.term_count(len(self.active)) if fitted else 0
             require_shape("theta", np.shape(self.theta), (fitted * terms,))
@@ -237,7 +242,7 @@ class Coordinates:
 
     @property
     def active(self) -> list[int]:
-        """Joints that the fitted family depends on."""
+        """The joints that are not idle; the fitted family depends on them."""
         return [i for i in range(self.space.n) if i not in self.idle]
 
     @property
@@ -249,7 +254,7 @@ class Coordinates:
 
     @property
     def as_matrices(self) -> bool:
-        """Whether the graphs consist of dense matrix products, as for networks."""
+        """Whether the functions consist of dense matrix products, as for networks."""
         return bool(len(self.offset)) and self.family.as_matrices
 
     @cached_property
@@ -258,7 +263,7 @@ class Coordinates:
         return self.parametrisation.family(self.space.restricted_to(self.active), len(self.offset))
 
     def expression(self, q: Expression) -> Expression:
-        """xi(q), (r, N), for joint positions as columns (n, N)."""
+        """The expression of xi, (r, N), for joint positions q as columns (n, N)."""
         columns = q.shape[1]
         rows: list[Expression] = []
         # fitted coordinates, then the joints that are coordinates themselves
@@ -279,7 +284,7 @@ class Coordinates:
         return self.into("jacobian", np.empty((len(points), self.r, self.space.n)), points)
 
     def once(self, name: str, points: Array) -> Array:
-        """Values of `xi` or `jacobian`, without building what makes later calls fast."""
+        """Values of `xi` or `jacobian` for a single call: without building the faster functions for later calls."""
         if self.as_matrices:
             return self.xi(points) if name == "xi" else self.jacobian(points)
         return Batched(self.functions[name])(points)[0]
@@ -306,8 +311,8 @@ class Coordinates:
             J_active = parts["jacobian"](q[active]) * ca.repmat(scale, 1, len(active))
             J.append(J_active @ ca.DM(unit[active]) if idle else J_active)
             if "jacobian_rate" in parts:
-                # A function of its own, so that C computes it once for several w. CasADi writes out what is called with
-                # its own symbols, so it has others.
+                # The rate is a function of its own, so that C computes it once for several w. It has its own symbols,
+                # because CasADi inlines a function that is called with the symbols that define it.
                 at, along = (ca.MX.sym(name, n) for name in ("q", "v"))
                 rate = parts["jacobian_rate"](at[active], along[active])
                 second.append((ca.Function("dJ_xi", [at, along], [rate])(q, v) @ w[active]) * scale)
@@ -321,12 +326,13 @@ class Coordinates:
 
     @cached_property
     def _point_by_point(self) -> BuiltOnUse[str, BlockedFunction]:
+        """xi and jacobian for few joint positions: as scalar code, except for networks."""
         fast = (lambda graph: graph) if self.as_matrices else expand_scalars
         return BuiltOnUse(lambda name: BlockedFunction(fast(self.functions[name])))
 
     @cached_property
     def _on_blocks(self) -> BuiltOnUse[str, Maker] | None:
-        """Makers of xi and jacobian on blocks of joint positions; None if matrix products do not make them fast."""
+        """Makers of xi and jacobian on blocks of joint positions; None if the family has no matrix products."""
         if self.as_matrices:
             return BuiltOnUse(lambda name: self._column_graphs[name].build_block_function)
         if not len(self.offset) or not isinstance(family := self.family, SelfDerivativeFamily):
@@ -335,9 +341,9 @@ class Coordinates:
 
     @cached_property
     def _column_graphs(self) -> dict[str, NumpyGraph]:
-        """Functions xi and vec(J_xi^T) of many joint positions side by side, where dense products are fast."""
+        """Graphs of xi and vec(J_xi^T) for many joint positions as columns (n, COLUMNS), for networks."""
         q = ca.MX.sym("q", self.space.n, COLUMNS)
-        # gradients of all coordinates, r matrices (n, N), for joint positions as columns (n, N)
+        # gradients of all coordinates: r matrices (n, N)
         N = q.shape[1]
         unit = np.eye(self.space.n)
         gradients: list[ca.MX] = []
@@ -350,11 +356,12 @@ class Coordinates:
 
 
 def _columns(values: Sequence[float] | Array, columns: int) -> ca.DM:
+    """The column of values, repeated."""
     return ca.DM(np.repeat(np.asarray(values, dtype=float)[:, None], columns, axis=1))
 
 
 def fill_coordinates(coordinates: CoordinateMap, name: str, results: Array, points: Array) -> None:
-    """Write xi or its Jacobian, by name, at points (N, n) to part of an array."""
+    """Write `xi` or `jacobian` (by `name`) at points (N, n) to `results`, which may be part of a larger array."""
     if isinstance(coordinates, Coordinates):
         coordinates.into(name, results, points)
     else:

@@ -1,7 +1,7 @@
-"""Self-motion curves of charts, r = 1: traced for many task values at once, and followed and searched in C.
+"""Tracing of self-motion curves, for many task values at once in NumPy, and kernels in C for r = 1.
 
-`CurveTracer` finds curves whatever the limits. `MotionKernel` follows the self-motion within the domain in C, and
-`SearchKernel` does in C what `curves.SelfMotionCurves` does.
+`CurveTracer` traces curves regardless of limits. `MotionKernel` follows a self-motion within the domain in C, and
+`SearchKernel` is the search of `curves.SelfMotionCurves` in C.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from orthocas.tools.expressions import wrap_shortest
 if TYPE_CHECKING:
     from orthocas.charts.chart import Chart
 
-# -O3 takes twice as long, and gains a tenth.
+# With -O3, compilation takes twice as long, and the code is only a tenth faster.
 _FLAGS = ("-O1",)
 
 
@@ -40,30 +40,30 @@ _FLAGS = ("-O1",)
 class CurveRules:
     """Numbers of the search along curves. Chosen on panda-wide and xarm7-wide (benchmarks/round_trips.py)."""
 
-    near_phi: int = 4  #: stored positions near each phi, from which curves are sought
-    near_x: int = 8  #: the same near each x
-    more: int = 24  #: the same, for rows without a solution
-    reach: int = 25  #: steps from a start to its x
-    reached: float = 1e-3  #: error, relative to the sizes of the components, that one more step reduces to its square
-    largest: float = 0.7  #: norm of one of those steps [rad] or [m]
-    missed: float = 0.08  #: largest correction of a step along a curve [rad] or [m]
-    step: float = 0.4  #: longest step along a curve [rad] or [m]
-    shortest: float = 0.03  #: a curve that needs shorter ones ends, near a singular position
-    most: int = 80  #: steps of a curve in one direction
+    near_phi: int = 4  #: stored positions near each phi at which curves start
+    near_x: int = 8  #: stored positions near each x at which curves start
+    more: int = 24  #: further stored positions near x, for rows without a solution
+    reach: int = 25  #: largest number of steps from a start to its x
+    reached: float = 1e-3  #: error of x, relative to the component sizes, at which a start counts as arrived
+    largest: float = 0.7  #: [rad] or [m] largest norm of one of those steps
+    missed: float = 0.08  #: [rad] or [m] largest correction of a step along a curve
+    step: float = 0.4  #: [rad] or [m] longest step along a curve
+    shortest: float = 0.03  #: [rad] or [m] a curve that needs shorter steps ends; it is near a singular position
+    most: int = 80  #: largest number of steps of a curve in one direction
     turned: float = 0.9  #: least cosine between the tangents at both ends of a step
-    straight: float = 0.96  #: cosine from which the next step may be longer
-    known: float = 0.05  #: distance [rad] or [m] from a curve up to which a start lies on it
-    parts: int = 3  #: points with xi on each step
-    corrections: int = 2  #: Newton's steps from such points to x
-    last_correction: float = 1e-3  #: largest last one of them [rad] or [m]
-    sagitta: float = 6e-3  #: largest distance of those parts from their chords [rad] or [m]
-    halvings: int = 5  #: of chords that pass the box between points outside
-    narrow: float = 1e-10  #: [rad] or [m]: brackets of an end of the domain
-    narrowings: int = 100  #: halvings until then at most
-    newton: int = 8  #: steps to a solution; those near a fold need more than four
-    snap: float = 1e-9  #: half-widths: solutions so close to the boundary are moved onto it
-    few: int = 16  #: rows up to which all starts are followed at once, though some lie on one curve
-    prismatic: float = 1.0  #: half-widths that a sliding joint may leave its range by
+    straight: float = 0.96  #: cosine above which the next step may be longer
+    known: float = 0.05  #: [rad] or [m] distance from a curve up to which a start counts as lying on it
+    parts: int = 3  #: parts of a step between points at which xi is evaluated
+    corrections: int = 2  #: Newton steps from such points to x
+    last_correction: float = 1e-3  #: [rad] or [m] largest last correction of a point that counts as having x
+    sagitta: float = 6e-3  #: [rad] or [m] largest distance of the curve from the chords of those parts
+    halvings: int = 5  #: halvings of chords that pass through the box between points outside
+    narrow: float = 1e-10  #: [rad] or [m] width of the bracket of an end of an arc
+    narrowings: int = 100  #: largest number of halvings of that bracket
+    newton: int = 8  #: Newton steps to a solution; solutions near a fold need more than four
+    snap: float = 1e-9  #: [half-widths] solutions so close to the boundary are moved onto it
+    few: int = 16  #: number of rows up to which all starts are traced at once, even if some lie on one curve
+    prismatic: float = 1.0  #: [half-widths] how far curves may leave the range of a prismatic joint
 
 
 RULES = CurveRules()
@@ -71,15 +71,15 @@ RULES = CurveRules()
 
 @dataclass(frozen=True, eq=False)
 class Traces:
-    """Curves of K targets: points in order, at most `RULES.step` apart."""
+    """K curves, each for one target: points in order, at most about `RULES.step` apart."""
 
     row: Indices  #: number of the target, (K,)
-    q: Array  #: (K, P, n), unwrapped; the last point is repeated after the end
+    q: Array  #: (K, P, n), continuous angles; the last point is repeated after the end of a curve
     tangent: Array  #: unit tangents there, (K, P, n)
     count: Indices  #: points of each curve, (K,)
 
     def part(self, curves: Indices) -> Traces:
-        """Some of the curves."""
+        """The selected curves."""
         row, q, tangent, count = (array[curves] for array in vars(self).values())
         longest = count.max(initial=1)
         return Traces(row, q[:, :longest], tangent[:, :longest], count)
@@ -87,18 +87,22 @@ class Traces:
 
 @dataclass(frozen=True, eq=False)
 class CurveTracer:
-    """Traces the curves of joint positions with the same task value and the same positions of r - 1 held joints.
+    """Traces curves of joint positions with the same task value and the same positions of r - 1 held joints.
 
-    x stands for the m task values, and the positions of the held joints after these.
+    In this class, x (n - 1,) stands for the m task values followed by the positions of the held joints.
     """
 
     boxed: BoxedPhi
-    held: tuple[int, ...] = ()  #: r - 1 joints
+    held: tuple[int, ...] = ()  #: indices of the r - 1 held joints; none for r = 1
 
     def reach(self, x: Array, starts: Array) -> tuple[Array, NDArray[np.bool_]]:
-        """Where damped least squares end from starts (M, n), without limits; whether x (M, m) is met, (M,)."""
+        """Move starts (M, n) to x (M, n - 1) by damped least squares, regardless of limits.
+
+        Returns:
+            Their ends (M, n), and whether x is met there, (M,).
+        """
         q, arrived, left = starts.copy(), np.zeros(len(starts), dtype=bool), np.arange(len(starts))
-        # rows drop out when they arrive, or where the step has no value
+        # rows drop out when they arrive, or when a step is not finite
         for _ in range(RULES.reach):
             found = self._damped_step(q[left], x[left])[0]
             q[left] += found[:, :-1]
@@ -109,14 +113,14 @@ class CurveTracer:
         return q, arrived
 
     def trace(self, x: Array, q: Array, rows: Indices) -> Traces:
-        """The curves through points q (K, n), from end to end, for x (K, n - 1)."""
+        """Trace the curves through points q (K, n), from end to end, for x (K, n - 1). `rows` (K,) are row numbers."""
         m, n = self.boxed.m, q.shape[1]
-        # the tangent is what all n - 1 held values leave free
+        # the tangent spans the null space of the n - 1 rows of J
         J = np.empty((len(q), n - 1, n))
         J[:, :m] = self.boxed.phi_map.jacobian(q)[:, :m] / self.boxed.phi_map.sizes[:m, None]
         J[:, m:] = np.eye(n)[list(self.held)]
         t = np.linalg.qr(J.transpose(0, 2, 1), mode="complete")[0][:, :, -1]
-        # one way, and for curves that do not close the other way
+        # follow each curve in one direction; if it does not close, also in the other
         ahead, tangents, count, closed = self._follow(x, q, t)
         back = np.flatnonzero(~closed)
         if not back.size:
@@ -124,7 +128,7 @@ class CurveTracer:
         behind, behind_tangents, behind_count, _ = self._follow(x[back], q[back], -t[back])
         before = np.zeros(len(q), dtype=np.int64)
         before[back] = behind_count - 1
-        # both halves in one order: the second one reversed, then the first
+        # join both halves: the second one reversed, then the first
         total = count + before
         place = np.arange(total.max())
         after = np.clip(place - before[:, None], 0, (count - 1)[:, None])
@@ -138,8 +142,8 @@ class CurveTracer:
         return Traces(rows, points, directions, total)
 
     def on_curves(self, q: Array, traces: Traces) -> NDArray[np.bool_]:
-        """Which of the positions q (K, S, n) lie on the curves, up to full turns, (K, S)."""
-        # angles as points on circles, so that full turns do not count
+        """Whether positions q (K, S, n) lie on their curves, up to full turns, (K, S)."""
+        # compare angles as points on circles, so that full turns do not matter
         mine, exists = self._on_circles(q), np.arange(traces.q.shape[1]) < traces.count[:, None]
         points = np.zeros((*exists.shape, mine.shape[2]))
         points[exists] = self._on_circles(traces.q[exists])
@@ -147,7 +151,7 @@ class CurveTracer:
         squares = np.where(exists, (points**2).sum(axis=2), np.inf)[:, None] - 2 * mine @ points.transpose(0, 2, 1)
         nearest = np.argmin(squares, axis=2)
         found = np.zeros(nearest.shape, dtype=bool)
-        # the distance to the segments on both sides of this vertex
+        # distance to the segments on both sides of this vertex
         for place in (np.maximum(nearest - 1, 0), nearest):
             start = np.take_along_axis(traces.q, place[:, :, None], axis=1)
             after = np.minimum(place + 1, traces.q.shape[1] - 1)
@@ -159,38 +163,38 @@ class CurveTracer:
         return found
 
     def away(self, q: Array) -> Array:
-        """Largest distances of joints (N, S, n) from their ranges, up to full turns, (N, S)."""
+        """Distance of q (N, S, n) to the domain's box, up to full turns: that of the farthest joint, (N, S)."""
         low, high = self.boxed.domain.bounds
         bounded = np.isfinite(low)
         centre, half = np.where(bounded, (low + high) / 2, 0.0), np.where(bounded, (high - low) / 2, np.inf)
         return np.asarray((np.abs(without_turns(q - centre, self.turning)) - half).max(axis=2).clip(0.0))
 
     def correct(self, x: Array, q: Array, t: Array) -> tuple[Array, Array]:
-        """Newton's steps to x across directions t (K, n), and tangents with t . tangent = 1, (K, n) each."""
+        """Newton steps from q (K, n) to x, perpendicular to t (K, n), and tangents u with t . u = 1, (K, n) each."""
         found = self._bordered_step(q, x, t)[0]
         return found[:, : q.shape[1]], found[:, q.shape[1] :]
 
     def _follow(self, x: Array, q0: Array, t0: Array) -> tuple[Array, Array, Indices, NDArray[np.bool_]]:
-        """Follow curves from q0 (K, n) along t0 until they close, leave the ranges of sliding joints, or fail.
+        """Follow curves from q0 (K, n) along t0 until they close, leave the ranges of prismatic joints, or fail.
 
         Returns:
-            Points and unit tangents (K, P, n), their number (K,), and which curves are closed, (K,).
+            Points and unit tangents (K, P, n), the number of points of each curve (K,), and whether it closes, (K,).
         """
         (K, n), size = q0.shape, RULES.most + 1
         points, tangents = np.empty((K, size, n)), np.empty((K, size, n))
         points[:, 0], tangents[:, 0] = q0, t0
         count, closed = np.ones(K, dtype=np.int64), np.zeros(K, dtype=bool)
-        # what `_step` takes for each curve: where it is, tangent, bend, length of the step, and where it began
+        # input of `_step` for each curve: point, tangent, curvature, length of the step, first point and tangent
         state = np.concatenate([q0, t0, np.zeros((K, n)), np.full((K, 1), RULES.step / 2), q0, t0], axis=1)
         left, before = np.arange(K), np.zeros(K)
         (low, high), room = self.boxed.domain.bounds, RULES.prismatic * self.boxed.domain.half_width
         for _ in range(RULES.most):
             found = self._step(state, x)[0]
-            # a step counts if it hits the curve and hardly turns
+            # accept a step if its correction is short and the tangent turns little
             new, onward, (missed, turned, gap, ahead) = found[:, :n], found[:, n : 2 * n], found[:, 2 * n :].T
             good = (missed < RULES.missed) & (turned > RULES.turned)
             moved, h = left[good], state[:, 3 * n]
-            # back at the start: near it, and passing it in the direction of the beginning
+            # The curve closes if it is near its start and passes it in the initial direction.
             around = good & (gap < 1.6 * RULES.step) & (before < 0) & (ahead >= 0) & (count[left] > 3)
             closed[left] = around
             points[moved, count[moved]], tangents[moved, count[moved]] = new[good], onward[good]
@@ -199,11 +203,11 @@ class CurveTracer:
             bend = (onward - state[:, n : 2 * n]) / h[:, None]
             state[:, : 3 * n] = np.where(good[:, None], np.hstack([new, onward, bend]), state[:, : 3 * n])
             before = np.where(good, ahead, before)
-            # lengths follow success
+            # longer steps on straight parts, half the step after a failure
             longer = np.where(turned > RULES.straight, np.minimum(1.6 * h, RULES.step), h)
             h[:] = np.where(good, longer, h / 2)
             goes_on = ~around & (h > RULES.shortest)
-            # sliding joints in their ranges, or not far outside
+            # stop curves whose prismatic joints are far outside their ranges
             if not self.turning.all():
                 goes_on &= (((state[:, :n] >= low - room) & (state[:, :n] <= high + room)) | self.turning).all(axis=1)
             if not goes_on.all():
@@ -216,24 +220,24 @@ class CurveTracer:
         return points, tangents, count, closed
 
     def _on_circles(self, q: Array) -> Array:
-        """Cosines and sines of revolute joints, and positions of the others: near one another where q (..., n) is."""
+        """Cosines and sines of revolute joints of q (..., n), then positions of prismatic ones, (..., k)."""
         turning, sliding = q[..., self.turning], q[..., ~self.turning]
         return np.concatenate([np.cos(turning), np.sin(turning), sliding], axis=-1)
 
     @property
     def equations(self) -> ca.Function:
-        """q, x -> e = (x - h(q)) / scale (n - 1, 1), and J / scale (n - 1, n)."""
+        """Function of q and x: scaled errors e (n - 1, 1) and scaled J (n - 1, n), as in `_symbols`."""
         q, x, e, J = self._symbols
         return dense_function("equations", [q, x], [e, J])
 
     @cached_property
     def _bordered_step(self) -> BlockedFunction:
-        """`_bordered` at many points."""
+        """`_bordered` for many points."""
         return BlockedFunction(self._bordered)
 
     @cached_property
     def _bordered(self) -> ca.Function:
-        """q, x, t -> the solution dq of J dq = x - h(q), t . dq = 0, and that of J dq = 0, t . dq = 1, (2n, 1)."""
+        """Function of q, x, t: the solution of J dq = e, t . dq = 0, then that of J u = 0, t . u = 1, (2n, 1)."""
         q, x, e, J = self._symbols
         t = ca.SX.sym("t", q.shape[0])
         right = ca.vertcat(ca.horzcat(e, ca.SX.zeros(e.shape[0])), ca.SX([[0.0, 1.0]]))
@@ -242,10 +246,11 @@ class CurveTracer:
 
     @cached_property
     def _step(self) -> BlockedFunction:
-        """One step: a column (q, t, bend, h, q0, t0) and x -> the new q and t, and four numbers.
+        """One step along many curves: a column (q, t, bend, h, q0, t0) and x -> new q, new t, four numbers.
 
-        The numbers are the length of the correction, the cosine between the tangents, and the distance of q from q0 up
-        to full turns, also along t0.
+        bend is the curvature vector dt/ds, h the length of the step, and q0, t0 the start of the curve. The numbers are
+        the length of the correction, the cosine between old and new t, the distance of the new q from q0 up to full
+        turns, and the component of this difference along t0.
         """
         q, x = self._symbols[:2]
         n = q.shape[0]
@@ -255,7 +260,7 @@ class CurveTracer:
         ahead = at + h * t + h**2 / 2 * bend
         change, onward = ca.horzsplit(ca.reshape(self._bordered(ahead, x, t), n, 2))
         new, onward = ahead + change, onward / ca.norm_2(onward)
-        # how far it is from the start, less full turns
+        # difference from the start, without full turns
         gap = new - q0
         gap -= 2 * np.pi * ca.DM(self.turning.astype(float)) * ca.floor(gap / (2 * np.pi) + 0.5)
         numbers = ca.vertcat(ca.norm_2(change), ca.dot(t, onward), ca.norm_2(gap), ca.dot(gap, t0))
@@ -263,7 +268,7 @@ class CurveTracer:
 
     @cached_property
     def _damped_step(self) -> BlockedFunction:
-        """q, x -> a step of damped least squares to x, and the largest error, (n + 1, 1)."""
+        """Function of q and x for many points: a damped least-squares step to x, then the largest error, (n + 1, 1)."""
         q, x, e, J = self._symbols
         error, gram = ca.norm_inf(e), J @ J.T
         damping = ca.if_else(error > 0.1, 1e-2, ca.if_else(error > 1e-3, 1e-5, 1e-14)) * ca.trace(gram)
@@ -273,7 +278,11 @@ class CurveTracer:
 
     @cached_property
     def _symbols(self) -> tuple[ca.SX, ca.SX, ca.SX, ca.SX]:
-        """q (n, 1), x (n - 1, 1), errors (x - h(q)) / scale (n - 1, 1), and rates J / scale (n - 1, n)."""
+        """Symbols q (n, 1) and x (n - 1, 1), and expressions of the errors e (n - 1, 1) and their J (n - 1, n).
+
+        The task rows are e = (x - h(q)) / sizes and J = (dh/dq) / sizes. For held joints, e = x - q, and J has rows of
+        the identity.
+        """
         task, held = self.boxed.task, list(self.held)
         n, m, scale = task.robot.n, task.m, ca.DM(self.boxed.phi_map.sizes[: self.boxed.m])
         relative = Relative(task)
@@ -284,17 +293,17 @@ class CurveTracer:
 
     @cached_property
     def turning(self) -> NDArray[np.bool_]:
-        """Revolute joints, (n,)."""
+        """Whether each joint is revolute, (n,)."""
         return ~np.array(self.boxed.task.robot.tree.prismatic)
 
 
 def without_turns(difference: Array, turning: NDArray[np.bool_]) -> Array:
-    """Differences of joint positions (..., n) without full turns of revolute joints."""
+    """Differences of joint positions (..., n), wrapped to half a turn for revolute joints."""
     return np.asarray(wrap_shortest(difference, np.where(turning, 2 * np.pi, 0.0)))
 
 
 def solutions_of(A: Array, right: Array) -> Array:
-    """A^-1 right, (N, n, k); the least-squares solution where A is singular."""
+    """A^-1 right, (N, n, k), for A (N, n, n) and right (N, n, k); if A is singular, its pseudo-inverse times right."""
     try:
         found: Array = np.asarray(np.linalg.solve(A, right), dtype=float)
     except np.linalg.LinAlgError:
@@ -304,17 +313,17 @@ def solutions_of(A: Array, right: Array) -> Array:
 
 @dataclass(frozen=True, slots=True)
 class MotionKernelRules:
-    """Numbers of the way."""
+    """Numbers of the kernels in C."""
 
-    points: int = 30_000  #: of a way, at most: with more, Python follows it
-    nodes: int = 4000  #: of the curve, after which it counts as endless
-    divided: float = 0.95  #: parts of a step between two points, of the spacing that is wanted
-    rounding: float = 2e-12  #: of the place of a boundary on a step [rad] or [m]
-    piece: int = 64  #: rows that a thread takes at once
+    points: int = 30_000  #: largest number of points of a curve; longer curves are followed in Python
+    nodes: int = 4000  #: number of steps after which a curve counts as endless
+    divided: float = 0.95  #: distance between points on a chord, relative to the required spacing along the curve
+    rounding: float = 2e-12  #: [rad] or [m] tolerance of the place where a step crosses a boundary
+    piece: int = 64  #: rows that a thread searches at once
 
 
 MOTION = MotionKernelRules()
-ENDLESS, SINGULAR, WALL, FOLD = range(4)  #: what ends a way, as in templates/chart_motion.c.jinja
+ENDLESS, SINGULAR, WALL, FOLD = range(4)  #: what ends a curve, as in templates/chart_motion.c.jinja
 
 
 @dataclass(frozen=True, eq=False)
@@ -326,21 +335,21 @@ class MotionKernel:
     def follow(
         self, q: Array, x: Array, direction: int, folds: bool, spacing: float
     ) -> tuple[Array, Array, Array, int, Array] | None:
-        """The way from q (n,) inside along which xi rises, 1, or falls, -1; None if it has too many points.
+        """Follow the self-motion from q within the domain.
 
         Args:
-            q: the start.
+            q: the start inside the domain, (n,).
             x: its task value, (m,).
-            direction: 1 or -1.
-            folds: whether it ends where xi turns back.
-            spacing: of points [rad] or [m], at most.
+            direction: 1 if xi rises from q, -1 if it falls.
+            folds: whether the curve ends where xi turns back.
+            spacing: largest distance between points [rad] or [m].
 
         Returns:
-            Points (N, n), the start first, their xi (N,), the length of the way up to each (N,), what ends it, and a
-            point just beyond that (n,), where it is a wall or a fold.
+            Points (N, n), the start first; xi (N,) and the arc length (N,) at each; what ends the curve; and, if that
+            is a wall or a fold, a point (n,) just beyond it. None if the curve has more than `MOTION.points` points.
         """
         n, most = len(q), MOTION.points
-        # Memory that nothing writes to costs nothing.
+        # Buffers of the largest size cost nothing: pages that are never written are never allocated.
         room, points = np.empty(MOTION.nodes * (2 * n + 1)), np.empty((most, n))
         xi, length, beyond = np.empty(most), np.empty(most), np.full(n, np.nan)
         stop = ctypes.c_int()
@@ -354,6 +363,7 @@ class MotionKernel:
 
     @cached_property
     def _c(self) -> Any:
+        """The compiled library."""
         values = {"divided": MOTION.divided, "rounding": MOTION.rounding, "rules": asdict(curves.RULES)}
         sources = ("self_motion.c", "curve_math.c")
         return _load("chart", "chart_motion.c", _write_chart(self.chart) | values, sources, None)
@@ -361,19 +371,19 @@ class MotionKernel:
 
 @dataclass(frozen=True, eq=False)
 class SearchKernel:
-    """Searches the self-motion curves of many task values of a chart in C, with `runtime/curve_rows.c`.
+    """Searches the self-motion curves of a chart for many task values in C, with `runtime/curve_rows.c`.
 
     Threads may share it.
     """
 
     chart: Chart
-    folder: Path | None = None  #: where its library is kept; None: as `keep_library`
+    folder: Path | None = None  #: folder of the compiled library; None: the default of `keep_library`
 
     def search(self, targets: Array, starts: Array, first: int, tolerance: float) -> tuple[Array, Array, Any]:
-        """As `SelfMotionCurves.search`, for starts (N, S, n); those after the `first` ones serve unsolved rows.
+        """As `SelfMotionCurves.search`, for starts (N, S, n). Starts after the `first` ones are for unsolved rows.
 
         Returns:
-            Points (N, n), their distances (N,), and whether they are neither solutions nor ends of arcs, (N,).
+            The fields of `Nearest`: points (N, n), their distances (N,), and `between` (N,).
         """
         count = len(targets)
         q, distance, between = np.empty(targets.shape), np.empty(count), np.empty(count, dtype=np.bool_)
@@ -393,7 +403,7 @@ class SearchKernel:
         return q, distance, between
 
     def trace(self, target: Array, starts: Array) -> list[tuple[Array, Array]]:
-        """Points (P, n) and unit tangents of each curve of a target to which starts (S, n) lead."""
+        """Trace the curves of a target phi (n,) to which starts (S, n) lead: points (P, n) and unit tangents."""
         n, nodes, used = self.chart.n, np.empty((curves.RULES.nodes, 2 * self.chart.n + 1)), ctypes.c_int()
         ends, closed = (np.zeros(curves.RULES.curves, dtype=np.intc) for _ in range(2))
         first = np.ascontiguousarray(starts)
@@ -406,6 +416,7 @@ class SearchKernel:
 
     @cached_property
     def _c(self) -> Any:
+        """The compiled library."""
         parts, m = self.chart.parts, self.chart.m
         values = {
             "rules": asdict(curves.RULES) | {"starts": 1 + RULES.near_phi + RULES.near_x + RULES.more},
@@ -421,9 +432,10 @@ class SearchKernel:
 
 
 def has_library(kernel: MotionKernel | SearchKernel) -> bool:
-    """Whether a kernel is there, compiled now or earlier: not without a compiler, nor for charts that C does not know.
+    """Whether a kernel can be used; compiles it if needed.
 
-    C knows fitted coordinates with r = 1, on domains whose condition, if there is one, has an expression.
+    False without a C compiler, and for charts that the kernels do not support. They support fitted coordinates with
+    r = 1 on domains whose condition, if there is one, has a CasADi expression.
     """
     chart, domain = kernel.chart, kernel.chart.problem.domain
     known = domain.is_box or domain.known_condition is not None
@@ -437,15 +449,15 @@ def has_library(kernel: MotionKernel | SearchKernel) -> bool:
 
 
 def _load(kind: str, template: str, values: dict[str, Any], sources: tuple[str, ...], folder: Path | None) -> Any:
-    """The library of a template with its values, and of runtime sources that it includes."""
+    """Compile and load the library of a template, filled with `values`, and of the runtime sources that it includes."""
     texts = {template: render(template, values, __package__), **{name: get_source(name) for name in sources}}
     return load_library(keep_library(kind, texts, _FLAGS, folder))
 
 
 def _write_chart(chart: Chart) -> dict[str, Any]:
-    """What the templates take of a chart, and the numbers of the search.
+    """Values of a chart for the C templates: generated kernels, domain, and joint types.
 
-    Kernels are errors and gradients of the task, xi with its gradient, and the condition of the domain, if it has one.
+    The kernels are errors and rates of the task, xi, its gradient, and the condition of the domain, if there is one.
     """
     domain, (low, high), own = chart.domain, chart.domain.bounds, chart.coordinates.functions
     q, x = ca.MX.sym("q", chart.n), ca.MX.sym("x", chart.m)

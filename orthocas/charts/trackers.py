@@ -1,4 +1,4 @@
-"""Trackers of moving targets, which stay or go as near as they can where phi is out of reach."""
+"""Trackers of moving targets phi. If phi is out of reach, a tracker stays, or goes as near to phi as it can."""
 
 from __future__ import annotations
 
@@ -26,44 +26,44 @@ from orthocas.tools.interrupts import deferred
 
 @dataclass(frozen=True, slots=True)
 class TrackerRules:
-    """Numbers of the tracker."""
+    """Numbers of the tracker. Errors of phi are relative to its component sizes."""
 
-    rounded: float = 1e-9  #: error up to which only rounding may have stopped the decrease
-    returned: float = 1e-8  #: of phi, relative to its sizes: the tracker is back
-    refreshes: int = 8  #: of the Jacobian in a call
-    step: float = 0.1  #: of the half-widths: default of the largest change of q in a call
-    halvings: int = 4  #: of a change of xi that has no solution
+    rounded: float = 1e-9  #: error of phi below which a stalled iteration counts as converged
+    returned: float = 1e-8  #: error of phi up to which two values count as equal
+    refreshes: int = 8  #: largest number of new Jacobians in a call
+    step: float = 0.1  #: [half-widths] default of the largest change of q in a call
+    halvings: int = 4  #: largest number of halvings of a change of xi that has no solution
 
 
 TRACKER = TrackerRules()
 
 
 class TrackerStatus(IntEnum):
-    """How the last call of a tracker ended. With JUMP to BAD_INPUT, q stays where it was."""
+    """How the last call of a tracker ended. With the values 1 to 5, q stays where it was."""
 
     OK = 0  #: phi(q) = phi, inside the domain
     JUMP = 1  #: q would have moved by more than `largest_step`
     OUTSIDE_DOMAIN = 2  #: q would have left the domain
-    SINGULAR = 3  #: J is singular, or nearly so
-    LOST = 4  #: no solution near the last q
-    BAD_INPUT = 5  #: a number of phi is not finite
-    NEAREST = 6  #: a local minimum of the distance to phi in the domain; of trackers with `nearest=True`
-    NEARER = 7  #: at least as near as before, but no minimum: `largest_step` or the work of a call ended the descent
-    YIELDING = 8  #: x is met, and xi gives way to keep clear of contacts; of trackers with `avoid`
-    BRAKED = 9  #: a part of the way, or none: all of it would come nearer to a contact than `margin` allows
+    SINGULAR = 3  #: J is singular or nearly singular
+    LOST = 4  #: no solution was found near the last q
+    BAD_INPUT = 5  #: an entry of phi is not finite
+    NEAREST = 6  #: q is a local minimum of the distance to phi in the domain; only with `nearest=True`
+    NEARER = 7  #: q is no farther from phi than before; `largest_step` or the work limit ended the descent of this call
+    YIELDING = 8  #: x is met, and xi deviates from its target to avoid contacts; only with `avoid`
+    BRAKED = 9  #: q went only a part of the way, or stayed, to keep the `margin` to a contact
 
 
 class Tracker(Shown):
-    """Follows a stream of phi: each call starts where the last one ended, and never leaves the domain.
+    """Follows a stream of targets phi: each call starts at the last q, and q never leaves the domain.
 
-    A call takes chord steps with the Jacobian of an earlier call, and evaluates a new one only where they do not
-    converge. If the new q would be too far from the last one or outside the domain, or if there is none, `step` returns
-    the last q again, and `status` says why. `Chart.tracker` makes trackers; each belongs to one thread.
+    A call takes Newton steps with the Jacobian of an earlier call (chord steps), and evaluates a new Jacobian only if
+    they do not converge. If there is no new q, or if it is too far from the last one or outside the domain, `step`
+    returns the last q again, and `status` says why. `Chart.tracker` makes trackers. A tracker belongs to one thread.
 
-    With a collision model, no call comes nearer to a contact than a margin: it goes a part of the way, with the status
-    BRAKED. With `avoid`, xi gives way before: of the xi whose pairs are at least as far as that, the tracker goes to
-    one near the wished one, with x met and the status YIELDING. With r > 1 or several pairs it is not always the
-    nearest.
+    With a collision model, no call comes nearer to a contact than the margin. The tracker then goes only a part of the
+    way, with the status BRAKED. With `avoid`, xi yields before that: the tracker meets x and chooses an xi near its
+    target that keeps all pairs at least `avoid` apart, with the status YIELDING. With r > 1 or several pairs, this xi
+    is not always the nearest.
 
     Example:
         >>> import numpy as np
@@ -96,7 +96,7 @@ class Tracker(Shown):
         if not (limit > 0).all():
             raise InvalidValueError("largest_step", limit.tolist(), "positive numbers")
         self._limit = np.broadcast_to(limit, n)
-        self._parts: tuple[Any, ...] = functions, domain, self._limit, m, clearance  # what makes another one
+        self._parts: tuple[Any, ...] = functions, domain, self._limit, m, clearance  # arguments that a copy needs
         self._solver = PointSolver(functions)
         self._before, self._guarded = np.empty(n), np.empty(2)
         with deferred(), building:  # CasADi's expressions are not for several threads at a time
@@ -105,7 +105,7 @@ class Tracker(Shown):
         self.reset(q0)
 
     def __getstate__(self) -> dict[str, Any]:
-        """Without scratch memory."""
+        """The state without CasADi buffers, which cannot be pickled."""
         return {"parts": self._parts, "q": self.q, "start": self._start, "target": self._solver.target}
 
     def __setstate__(self, state: dict[str, Any]) -> None:
@@ -120,10 +120,10 @@ class Tracker(Shown):
 
     @property
     def left_over(self) -> Array | None:
-        """What the way since the last reset leaves over in the joints, (n,), less full turns of endless joints.
+        """Change of the joints since the last reset, once phi is back at its value there, (n,) [rad] or [m].
 
-        None while x or xi differ from those of the start. A loop around a full turn of tool or base may leave
-        something over, see `ChartParts.left_over`.
+        Full turns of joints without boundaries are removed. None while x or xi differ from those at the start. The
+        change need not be 0 after a full turn of the tool or the base; see `ChartParts.left_over`.
         """
         q, phi = self._start
         apart = self._functions.distance(phi, self._solver.phi)
@@ -135,7 +135,7 @@ class Tracker(Shown):
         return self._limit
 
     def facts(self) -> dict[str, str]:
-        """Where it is."""
+        """Status, joint position, and largest step."""
         return {
             "tracker": f"status {self.status.name}",
             "q": number_list(self._solver.q),
@@ -165,18 +165,19 @@ class Tracker(Shown):
         self.status = TrackerStatus.OK  #: how the last call ended
 
     def step(self, phi: ArrayLike | None = None, *, x: ArrayLike | None = None, xi: ArrayLike | None = None) -> Array:
-        """The q near the last one with phi(q) = phi, or the last one; see `status`.
+        """Move to the q near the last one with phi(q) = phi; if that fails, stay. `status` says which.
 
         Args:
             phi: target values, (n,).
-            x: in place of phi, those of the task, (m,). Without it, x stays what the last call asked for.
-            xi: in place of phi, those of the coordinates, (r,) or a number. Without it, xi stays as well.
+            x: in place of phi, target of the task, (m,). Default: the target of the last call.
+            xi: in place of phi, target of the coordinates, (r,) or a number. Default: the target of the last call.
 
         Returns:
             q, (n,) [rad] or [m].
 
         Raises:
-            InvalidValueError, ShapeError: if both phi and x or xi are given, or another number of entries.
+            InvalidValueError: if phi is given together with x or xi.
+            ShapeError: if a target has another number of entries.
         """
         solver = self._solver
         if x is not None or xi is not None:
@@ -201,12 +202,12 @@ class Tracker(Shown):
         return solver.q.copy()
 
     def _return(self) -> None:
-        """Go back to where the call began."""
+        """Go back to the q at which the call began."""
         self._solver.q[:] = self._before
         self._solver.refresh()
 
     def _keep_clear(self, clearance: Clearance) -> None:
-        """Let xi give way where the step came near a contact, and stop where it still comes too near."""
+        """Let xi yield if the step came nearer to a contact than `avoid`; shorten the step if it came too near."""
         solver = self._solver
         if clearance.avoid is not None:
             met = self.status == TrackerStatus.OK
@@ -224,7 +225,10 @@ class Tracker(Shown):
             self.status = TrackerStatus.BRAKED
 
     def _give_way(self, clearance: Clearance) -> None:
-        """Meet x, with an xi near the wished one that keeps clear."""
+        """Meet x with an xi that is near its target and keeps all pairs at least `avoid` apart.
+
+        The search starts at the last q, with the target of x and the xi there, and changes xi in a few rounds.
+        """
         solver, m = self._solver, self._m
         target = solver.target.copy()
         failed = self.status
@@ -235,7 +239,7 @@ class Tracker(Shown):
         for _ in range(rounds):
             if not solver.refresh():
                 break
-            # No joint moves by more than its limit.
+            # the remaining change of xi, corrected for contacts, and scaled so that no joint exceeds its largest step
             wish = wrap_shortest(target[m:] - solver.phi[m:], np.array(self._functions.turns[m:]))
             slopes = solver.inverse[:, m:]
             change = clearance.yield_to(solver.q, slopes, wish)
@@ -261,7 +265,7 @@ class Tracker(Shown):
             self.status = failed
 
     def _advance(self) -> TrackerStatus:
-        """Move to the solution; returns whether that is allowed."""
+        """Solve for the target from the last q, and return the status. Statuses 1 to 5 may leave q changed."""
         solver, fresh = self._solver, False
         for _ in range(TRACKER.refreshes):
             falls, error = solver.step(), solver.errors[-1]
@@ -272,7 +276,7 @@ class Tracker(Shown):
                 if outside > 0:
                     return TrackerStatus.OUTSIDE_DOMAIN
                 return TrackerStatus.JUMP if jump > 1 else TrackerStatus.OK
-            # far away, shorter steps lead to where whole ones converge
+            # If full steps fail even with a fresh J, shorter ones may reach the region of convergence.
             if falls or (fresh and solver.shorten()):
                 solver.accept()
             elif fresh:
@@ -283,12 +287,12 @@ class Tracker(Shown):
         return TrackerStatus.LOST if np.isfinite(solver.target).all() else TrackerStatus.BAD_INPUT
 
 
-#: with these, q has moved
+#: statuses with which q has moved
 _MOVED = tuple(TrackerStatus[name] for name in ("OK", "NEAREST", "NEARER", "YIELDING", "BRAKED"))
 
 
 def _guard(domain: Domain, limit: Array) -> ca.Function:
-    """q before, q -> the largest change relative to its limit, and a number > 0 outside the domain."""
+    """Function of the last and the new q (n, 1): the largest change relative to `limit`, and a number > 0 outside."""
     before, q = (ca.MX.sym(name, len(limit)) for name in ("before", "q"))
     outside = ca.mmax(ca.fabs(q - ca.DM(domain.centre)) - ca.DM(domain.reach))
     if domain.condition is not None:
@@ -297,9 +301,10 @@ def _guard(domain: Domain, limit: Array) -> ca.Function:
 
 
 def leave_over(apart: float, tolerance: float, change: Array, turning: tuple[int, ...]) -> Array | None:
-    """What a loop leaves over in the joints: their change (n,), less full turns of those that turn without end.
+    """Change of the joints (n,) after a loop in phi, without full turns of the joints `turning`.
 
-    None if phi at its ends differs by more than the tolerance, relative to the sizes of the components.
+    None if the loop is open: phi at its ends differs by `apart`, relative to the component sizes, more than
+    `tolerance`.
     """
     turns = np.zeros(len(change))
     turns[list(turning)] = 2 * np.pi
@@ -308,43 +313,45 @@ def leave_over(apart: float, tolerance: float, change: Array, turning: tuple[int
 
 @dataclass(frozen=True, slots=True)
 class ReachingRules:
-    """Numbers of the descent, in Python and C. Joints count in half-widths of the domain, errors of x in its sizes.
+    """Numbers of the descent of `ReachingTracker`, in Python and C.
 
-    Chosen on panda, iiwa7 and xarm7, held on eight arms (benchmarks/beyond_reach.py).
+    Joints are in half-widths of the domain, errors of x in component sizes. Chosen on panda, iiwa7 and xarm7, held on
+    eight arms (benchmarks/beyond_reach.py).
     """
 
-    xi_weight: float = 3e-4  #: of errors of xi, relative to those of x
-    damping: float = 0.3  #: of the first step, relative to |D^-1 e_x|: curvature that J^T J does not know
-    least_damping: float = 1e-11  #: so that every step has a solution
-    grows: float = 4.0  #: damping after a step that does not lower the cost
-    shrinks: float = 3.0  #: damping, divided by this, after a step that the model foresaw well
-    decrease: float = 1e-4  #: of the cost, relative to what the model promises
-    converged: float = 1e-8  #: relative decrease of the cost that a minimum may still promise
-    evaluations: int = 40  #: of the errors in a call; a moving target takes six
-    corrections: int = 3  #: of a step that ends beyond a curved boundary
-    room: float = 1e-6  #: to curved boundaries, relative
-    joint_room: float = 1e-9  #: in half-widths, in Python
-    still: float = 1e-13  #: smaller changes of a constraint along a step are rounding
+    xi_weight: float = 3e-4  #: weight of errors of xi, relative to those of x
+    damping: float = 0.3  #: damping of the first step, relative to |D^-1 e_x|, for the curvature that J^T J misses
+    least_damping: float = 1e-11  #: smallest damping, so that every step has a solution
+    grows: float = 4.0  #: factor of the damping after a step that does not lower the cost
+    shrinks: float = 3.0  #: divisor of the damping after a step that the model predicted well
+    decrease: float = 1e-4  #: least decrease of the cost for acceptance, relative to the predicted decrease
+    converged: float = 1e-8  #: predicted decrease, relative to the cost, below which a point is a minimum
+    evaluations: int = 40  #: largest number of evaluations of the errors in a call; a moving target takes six
+    corrections: int = 3  #: largest number of corrections of a step that ends beyond a curved boundary
+    room: float = 1e-6  #: margin to the conditions of the domain, in their own scale
+    joint_room: float = 1e-9  #: [half-widths] margin to joint boundaries, in Python
+    still: float = 1e-13  #: change of a constraint along a step below which it is rounding
 
 
 RULES = ReachingRules()
 
 
 class ReachingTracker(Tracker):
-    """A `Tracker` that goes as near as it can where phi is out of reach.
+    """A `Tracker` that goes as near to phi as it can if phi is out of reach.
 
-    From the last q it descends on
+    From the last q it minimises
 
         |D^-1 e_x|^2 + w^2 |e_xi|^2
 
-    within the domain, with the sizes D of x and w = 3e-4: x has priority, xi gives way. Each step solves a quadratic
-    program: damped J^T J is its Hessian; the joints' bounds, `largest_step` and the linearised conditions of the domain
-    are its constraints. So q slides along flat and curved boundaries alike, and rests where the target rests.
+    within the domain, with the errors e_x and e_xi, the component sizes D of x, and w = 3e-4: x has priority over xi.
+    Each step solves a quadratic program. Its Hessian is J^T J with damping. Its constraints are the joint boundaries,
+    `largest_step`, and the linearised conditions of the domain. So q slides along flat and curved boundaries, and comes
+    to rest when the target does.
 
-    A phi that is reached is met to rounding, as by `Tracker`. Otherwise `status` is NEAREST at a local minimum, where
-    the model promises less than 1e-8 of the cost. It is NEARER if `largest_step` or the bounded work of a call ended
-    the descent, which goes on in the next call. With a collision model, distances of near pairs are constraints of
-    each step, too: what a contact is in the way of counts as out of reach.
+    A phi within reach is met to rounding, as by `Tracker`. Otherwise `status` is NEAREST at a local minimum, where the
+    model predicts a decrease below 1e-8 of the cost. It is NEARER if `largest_step` or the work limit of a call ended
+    the descent; the next call continues it. With a collision model, distances of near pairs are constraints of each
+    step, too, so a target behind a contact counts as out of reach.
 
     Source:
         Levenberg and Marquardt's method with an active set; ours: docs/how-to/inverse.md.
@@ -370,7 +377,7 @@ class ReachingTracker(Tracker):
         self._low, self._high = domain.centre - ends, domain.centre + ends
 
     def step(self, phi: ArrayLike | None = None, *, x: ArrayLike | None = None, xi: ArrayLike | None = None) -> Array:
-        """As `Tracker.step`; where that stays, the nearest q (n,) that a descent from the last one finds."""
+        """As `Tracker.step`; if that fails, descend from the last q to the nearest q, (n,)."""
         q = super().step(phi, x=x, xi=xi)
         if self.status in (TrackerStatus.OK, TrackerStatus.YIELDING, TrackerStatus.BAD_INPUT):
             return q
@@ -393,7 +400,7 @@ class ReachingTracker(Tracker):
         return found
 
     def _descended(self, start: Array) -> tuple[Array, bool]:
-        """Where damped Gauss-Newton steps lead from q (n,), and whether that is a minimum."""
+        """Take damped Gauss-Newton steps from q (n,); return their end (n,), and whether it is a local minimum."""
         n, free = len(start), np.eye(len(start))
         first, last = start - self._limit, start + self._limit
         low = np.minimum(np.maximum(self._low, first), start)
@@ -430,7 +437,10 @@ class ReachingTracker(Tracker):
         return now.q, False
 
     def _inside(self, now: _Look, q: Array, low: Array, high: Array) -> _Look:
-        """The end q (n,) of a step, brought back inside the conditions of the domain; of infinite cost if it fails."""
+        """Evaluate the end q (n,) of a step, after corrections back into the conditions of the domain.
+
+        The cost is infinite if the corrections fail.
+        """
         enough = np.minimum(RULES.room / 2, now.rooms)
         new = self._look(np.clip(q, low, high))
         for _ in range(RULES.corrections):
@@ -445,7 +455,7 @@ class ReachingTracker(Tracker):
         return new if (new.rooms >= enough).all() else new._replace(cost=np.inf)
 
     def _look(self, q: Array) -> _Look:
-        """Errors and rooms at q (n,)."""
+        """Evaluate errors and constraints at q (n,)."""
         self._left -= 1
         self._at[:] = q
         self._near.run()
@@ -453,7 +463,7 @@ class ReachingTracker(Tracker):
         known = np.asarray(np.isfinite(self._slopes).all(axis=0))
         slopes, rooms = np.where(known[:, None], self._slopes.T, 0.0), self._rooms.copy()
         cost = cost if np.isfinite(cost) and np.isfinite(self._J).all() else np.inf
-        # Distances count like conditions of the domain.
+        # distances of near pairs are constraints like the conditions of the domain
         if self._clearance is not None:
             index, floor = self._near_parts
             values, gradients, _ = self._clearance.collisions.measure_parts(np.asarray(q), index)
@@ -462,18 +472,18 @@ class ReachingTracker(Tracker):
 
 
 class _Look(NamedTuple):
-    """What is known of a position."""
+    """Errors and constraints at one joint position."""
 
     q: Array  #: (n,)
-    cost: float  #: half the sum of squares of e; infinite where phi is undefined
+    cost: float  #: |e|^2 / 2; infinite where phi is undefined
     e: Array  #: weighted errors of phi, (n,)
     J: Array  #: de/dq, (n, n)
-    rooms: Array  #: of the domain's conditions and of near pairs, (k,), positive inside
+    rooms: Array  #: margins to the domain's conditions and to contacts of near pairs, (k,), positive inside
     slopes: Array  #: d rooms/dq, (k, n); 0 where undefined
 
 
 def least(H: Array, g: Array, rows: Array, low: Array, high: Array) -> tuple[Array, Array]:
-    """The d (n,) with the least g d + d H d / 2 of those with low <= rows d <= high, by a primal active set from d = 0.
+    """Minimise g d + d H d / 2 subject to low <= rows d <= high, by a primal active-set method from d = 0.
 
     Args:
         H: (n, n), positive definite.
@@ -483,8 +493,8 @@ def least(H: Array, g: Array, rows: Array, low: Array, high: Array) -> tuple[Arr
         high: (k,) >= 0, or infinity.
 
     Returns:
-        d, and which rows are held, (k,): -1 at low, 1 at high, 0 for none. If rounds run out, d is feasible, and lower
-        than 0, but not the least.
+        d (n,), and which constraints are active, (k,): -1 at low, 1 at high, 0 inactive. If the rounds run out, d is
+        feasible and no worse than d = 0, but not the minimum.
     """
     n, k = len(g), len(rows)
     d, held = np.zeros(n), np.zeros(k)
@@ -516,11 +526,11 @@ def least(H: Array, g: Array, rows: Array, low: Array, high: Array) -> tuple[Arr
 
 
 def near_function(phi: ca.Function, rates: ca.Function, m: int, known: PhiMap, domain: Domain) -> ca.Function:
-    """What `ReachingTracker` has to know of a position.
+    """The CasADi function of errors and constraints that `ReachingTracker` evaluates.
 
     Returns:
-        q, phi_d (n, 1) -> weighted errors e (n, 1), de/dq (n, n), rooms of the domain's conditions (k, 1), their slopes
-        (k, n).
+        q, phi_d (n, 1) -> weighted errors e (n, 1), de/dq (n, n), margins to the domain's conditions (k, 1), positive
+        inside, and their derivatives (k, n).
 
     Raises:
         DomainError: if the domain has a condition, but no expression of it.
@@ -529,7 +539,7 @@ def near_function(phi: ca.Function, rates: ca.Function, m: int, known: PhiMap, d
     q, target = ca.MX.sym("q", n), ca.MX.sym("target", n)
     weights = ca.DM(np.where(np.arange(n) < m, 1 / known.sizes, RULES.xi_weight))
     e, J = -known.difference(target, phi(q)), rates(q)
-    if relative is not None:  # rates are those of an orientation that is reached
+    if relative is not None:  # `rates` is de/dq at e = 0 only; use the derivative at the actual error
         J = ca.vertcat(relative.error(q, target[:m])[1], J[m:, :])
     rooms = rooms_of(domain, q)
     outputs = [e * weights, J * ca.repmat(weights, 1, n), rooms, ca.jacobian(rooms, q)]
