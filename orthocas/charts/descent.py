@@ -1,4 +1,4 @@
-"""One damped descent in a box, many rows at once: to phi(q) = phi, and to h(q) = x."""
+"""A damped descent in a box for many rows at once, to phi(q) = phi or to h(q) = x, and the search that uses it."""
 
 from __future__ import annotations
 
@@ -26,34 +26,34 @@ Flags = NDArray[np.bool_]
 
 @dataclass(frozen=True, slots=True)
 class DescentRules:
-    """Numbers of the descent. Joints count in half-widths, errors of x in sizes.
+    """Numbers of the descent. Joints are in half-widths, errors relative to component sizes.
 
     Chosen on panda-wide and pr2-left-wide, held on all ready charts (benchmarks/round_trips.py).
     """
 
-    goal: float = 1e-13  #: error at which rows end
-    kept: float = 1e-11  #: error up to which equations hold
-    most: int = 64  #: iterations
-    patience: int = 8  #: iterations within which the error must halve, where equations alone are solved
-    damping: float = 1e-6  #: of the first step of equations, relative to the mean eigenvalue of J^T J
-    least_damping: float = 1e-12  #: relative
-    most_damping: float = 1e6  #: relative; rows with more end
-    foreseen: float = 0.75  #: part of the promised decrease from which damping shrinks
-    missed: float = 0.25  #: the same up to which it doubles
-    shrinks: float = 0.1  #: damping, times this, after a step that the model foresaw
-    grows: float = 10.0  #: damping, times this, after one that is not taken
-    decrease: float = 1e-4  #: of the squared error, relative to what the model promises
-    converged: float = 1e-12  #: relative decrease of the squared error that a minimum may still promise
+    goal: float = 1e-13  #: error at which a row ends
+    kept: float = 1e-11  #: error of x up to which h(q) = x counts as met
+    most: int = 64  #: largest number of iterations
+    patience: int = 8  #: iterations within which the error must halve
+    damping: float = 1e-6  #: damping of the first step, relative to the mean eigenvalue of J^T J
+    least_damping: float = 1e-12  #: smallest damping, relative to the same
+    most_damping: float = 1e6  #: a row that needs more damping, relative to the same, ends
+    foreseen: float = 0.75  #: actual over predicted decrease above which the damping shrinks
+    missed: float = 0.25  #: actual over predicted decrease below which the damping doubles
+    shrinks: float = 0.1  #: factor of the damping after a well predicted step
+    grows: float = 10.0  #: factor of the damping after a rejected step
+    decrease: float = 1e-4  #: least decrease of the squared error for acceptance, relative to the predicted one
+    converged: float = 1e-12  #: predicted decrease, relative to the squared error, below which a point is a minimum
     rounded: float = 1e-26  #: squared error that is rounding
-    rounds: int = 24  #: guesses which bounds hold, before a row is solved alone
-    slack: float = 1e-13  #: of bounds
-    probes: int = 32  #: positions at which full turns are tried
+    rounds: int = 24  #: largest number of active sets that a quadratic program tries
+    slack: float = 1e-13  #: tolerance of bounds
+    probes: int = 32  #: number of positions at which full turns of joints are evaluated
     same: float = 1e-9  #: change of xi that is rounding
-    stored: tuple[int, ...] = (4, 16, 64)  #: positions from which a row is searched: at first, and without a solution
-    all: int = 64  #: near phi, and as many near x, for all solutions of one target
-    stored_most: int = 32  #: iterations from one of these
-    stored_patience: int = 3  #: of these, within which the error must halve
-    rows: int = 1024  #: whose starts are held in memory
+    stored: tuple[int, ...] = (4, 16, 64)  #: `search`: stored positions tried in all, after each of its stages
+    all: int = 64  #: `find_all`: stored positions near phi, and as many near x
+    stored_most: int = 32  #: largest number of iterations from a stored position
+    stored_patience: int = 3  #: iterations within which the error must halve, from a stored position
+    rows: int = 1024  #: rows searched at once, to bound memory
 
 
 RULES = DescentRules()
@@ -67,20 +67,20 @@ def descend(
     most: int = RULES.most,
     patience: int = RULES.patience,
 ) -> tuple[Array, Array]:
-    """Points u of the box with the least |e(u)|^2 near a start, for each row, with the errors e of phi or of x alone.
+    """Minimise |e(u)|^2 over points u of the box from a start, for N rows, where e is the error of phi or of x alone.
 
-    Each step d is the minimum of a quadratic program,
+    Each step d solves a quadratic program,
 
-        |J d - e|^2 / 2 + damping |d|^2 / 2    with    low <= u + d <= high,
+        minimise |J d - e|^2 / 2 + damping |d|^2 / 2    subject to    low <= u + d <= high,
 
-    by Levenberg and Marquardt's rule.
+    with Levenberg and Marquardt's damping.
 
     Args:
         boxed: phi in the box.
         targets: values of phi, (N, n).
-        start: points of the box, (N, n).
-        whole: whether phi(q) = phi is to hold, or h(q) = x alone.
-        most: iterations.
+        start: points u of the box, (N, n).
+        whole: True to solve phi(q) = phi; False to solve h(q) = x alone.
+        most: largest number of iterations.
         patience: iterations within which the error must halve.
 
     Returns:
@@ -93,7 +93,7 @@ def descend(
         run = _Run(boxed, targets, start, whole)
         rows, before = np.flatnonzero(np.isfinite(run.square)), run.error.copy()
         for k in range(1, most + 1):
-            # rows that do not halve their error in some steps end
+            # rows whose error has not halved within `patience` iterations end
             if k % patience == 0:
                 rows = rows[run.error[rows] <= before[rows] / 2]
                 before[rows] = run.error[rows]
@@ -105,7 +105,7 @@ def descend(
 
 
 class _Run:
-    """The state of all rows."""
+    """The state of `descend` for all rows."""
 
     def __init__(self, boxed: BoxedPhi, targets: Array, start: Array, whole: bool) -> None:
         N, n = start.shape
@@ -116,13 +116,13 @@ class _Run:
         self.minimal = np.zeros(N, dtype=bool)
         self.damping = np.full(N, RULES.damping)
         self._J = np.zeros((N, self._errors.shape[1], n))
-        # rows whose J belongs to u
+        # rows whose J was evaluated at the present u
         self._fresh = np.zeros(N, dtype=bool)
-        # which bounds hold: -1 low, 1 high
+        # active bounds of the last step: -1 low, 1 high, 0 inactive
         self._at = np.zeros((N, n), dtype=np.int8)
 
     def advance(self, rows: Indices) -> None:
-        """Try a step in some rows."""
+        """Try a step in the given rows."""
         stale = rows[~self._fresh[rows]]
         if stale.size:
             self._J[stale] = self._boxed.jacobians(self._targets[stale], self.u[stale], self._whole)
@@ -130,7 +130,7 @@ class _Run:
         undefined = ~np.isfinite(self._J[rows]).all(axis=(1, 2))
         self.damping[rows[undefined]] = np.inf
         rows = rows[~undefined]
-        # the quadratic models of some rows
+        # the quadratic program of each row: Hessian J^T J with damping, gradient -J^T e
         G, n = self._J[rows], self.u.shape[1]
         H = G.transpose(0, 2, 1) @ G
         mean = np.trace(H, axis1=1, axis2=2) / n + np.finfo(float).tiny
@@ -157,7 +157,7 @@ class _Run:
 
 @dataclass(frozen=True, eq=False)
 class Programs:
-    """N programs: minimise g d + d H d / 2 with low <= d <= high; low <= 0 <= high."""
+    """N quadratic programs: minimise g d + d H d / 2 subject to low <= d <= high, where low <= 0 <= high."""
 
     H: Array  #: (N, n, n), positive definite
     g: Array  #: (N, n)
@@ -165,32 +165,36 @@ class Programs:
     high: Array  #: (N, n)
 
     def part(self, rows: Indices) -> Programs:
-        """Some of them."""
+        """The programs of some rows."""
         return Programs(*(array[rows] for array in vars(self).values()))
 
 
 def solve_programs(programs: Programs, at: NDArray[np.int8]) -> tuple[Array, NDArray[np.int8], Flags]:
-    """Minima d (N, n) of programs, and which bounds of d hold there (-1 low, 1 high), from a guess of these, (N, n).
+    """Solve quadratic programs by a primal-dual active-set method, from a guess `at` (N, n) of the active bounds.
 
-    Each round solves with the bounds that the last one led to: those that are broken hold, those with multipliers of
-    the wrong sign do not. Rows that go on changing are not solved, (N,).
+    Each round solves with the present active set. Then violated bounds become active, and active bounds with
+    multipliers of the wrong sign become inactive, until nothing changes.
+
+    Returns:
+        Minima d (N, n); the active bounds (N, n): -1 low, 1 high, 0 inactive; and whether each row is solved, (N,):
+        False if its active set still changes after `RULES.rounds`.
     """
     N = len(programs.g)
     d, held, left = np.zeros_like(programs.g), at.copy(), np.arange(N)
     for k in range(RULES.rounds):
         part, on = programs if len(left) == N else programs.part(left), held[left]
-        # joints at a bound get the equation d = bound
+        # joints with an active bound get the equation d = bound
         K, joint = part.H.copy(), on != 0
         here, j = np.nonzero(joint)
         K[here, j], K[here, j, j] = 0.0, 1.0
         bounds = np.where(on < 0, part.low, part.high)
         d[left] = step = np.linalg.solve(K, np.where(joint, bounds, -part.g)[:, :, None])[:, :, 0]
-        # bounds stay while the slope pushes against them; others begin where d passes them
+        # a bound stays active while the gradient pushes against it; it becomes active when d violates it
         slope = (part.H @ step[:, :, None])[:, :, 0] + part.g
         now = np.where(joint, on * (slope * on < 0), 0)
         now += ~joint * ((step > part.high + RULES.slack) * 1 - (step < part.low - RULES.slack) * 1)
         changes = now != on
-        # the first bound alone, so that they do not change back and forth
+        # later change only the first bound in each round, so that the active set does not cycle
         if k >= RULES.rounds // 3:
             changes &= np.cumsum(changes, axis=1) == 1
         held[left] = np.where(changes, now, on)
@@ -204,9 +208,9 @@ def solve_programs(programs: Programs, at: NDArray[np.int8]) -> tuple[Array, NDA
 
 @dataclass(frozen=True, eq=False)
 class BoxedPhi:
-    """phi at points u = (q - centre) / half_width of the box of a domain, and equations there.
+    """phi in the box of a domain, with points given as u = (q - centre) / half_width, and its errors and derivatives.
 
-    Values need not be finite: errors are infinite there, and derivatives 0 or NaN.
+    Where phi is not finite, errors are infinite, and derivatives are 0 or NaN.
     """
 
     task: Task
@@ -226,21 +230,21 @@ class BoxedPhi:
 
     @cached_property
     def high(self) -> Array:
-        """Highest u, (n,)."""
+        """Highest u, (n,): 1, or inf for joints without boundaries."""
         return (self.domain.bounds[1] - self.domain.centre) / self.domain.half_width
 
     def points(self, u: Array) -> Array:
-        """q at u (N, n), within the boundaries, (N, n)."""
+        """q of points u (N, n), clipped to the box, (N, n)."""
         domain = self.domain
         return np.clip(domain.centre + domain.half_width * u, *domain.bounds)
 
     def of_points(self, q: Array) -> Array:
-        """u of the points of the box nearest to q (N, n), (N, n)."""
+        """u of joint positions q (N, n), clipped to the box, (N, n)."""
         u = (q - self.domain.centre) / self.domain.half_width
         return np.clip(u, self.low, self.high)
 
     def errors(self, targets: Array, u: Array, whole: bool) -> Array:
-        """(phi - phi(q)) / scale for targets (N, n), (N, n), scale as in `PhiMap`; not `whole`: of x alone, (N, m)."""
+        """Errors for targets phi (N, n), divided by `PhiMap.scale`: of phi, (N, n), if `whole`; else of x, (N, m)."""
         if whole:
             errors = self.phi_map.residual(targets, self.points(u))
         else:
@@ -249,7 +253,7 @@ class BoxedPhi:
         return np.where(np.isfinite(errors), errors, np.inf)
 
     def jacobians(self, targets: Array, u: Array, whole: bool) -> Array:
-        """How fast these errors fall with u, (N, n, n) or (N, m, n); 0 where undefined."""
+        """Negative derivatives of the scaled errors by u, (N, n, n) if `whole`, else (N, m, n); 0 where undefined."""
         if whole:
             J = self.phi_map.jacobian(self.points(u))
         else:
@@ -259,26 +263,29 @@ class BoxedPhi:
         return np.where(np.isfinite(J), J, 0.0)
 
     def gaps(self, targets: Array, u: Array) -> Array:
-        """phi - phi(q), (N, n), for targets (N, n), by the shorter way around."""
+        """phi - phi(q), (N, n), for targets phi (N, n), by the shorter way around."""
         q, gaps = self.points(u), np.empty_like(u)
         self._task_gaps.into(gaps[:, : self.m], q, targets[:, : self.m])
         gaps[:, self.m :] = self.xi_gaps(targets, q)
         return gaps
 
     def xi_gaps(self, targets: Array, q: Array) -> Array:
-        """xi - xi(q), (N, r), for targets (N, n) of phi."""
+        """xi - xi(q), (N, r), for targets phi (N, n), by the shorter way around."""
         return np.asarray(wrap_shortest(targets[:, self.m :] - self.xi(q), self.phi_map.difference.turns[self.m :]))
 
     @cached_property
     def _task_gaps(self) -> BlockedFunction:
-        """q, x -> x - h(q)."""
+        """Function of q and x for many points: x - h(q), (m, 1), by the shorter way around for orientations."""
         q, x = ca.SX.sym("q", len(self.domain.centre)), ca.SX.sym("x", self.m)
         gap = Relative(self.task).difference(x, self.task.function(q))
         return BlockedFunction(dense_function("gap", [q, x], [gap]))
 
     @cached_property
     def turned(self) -> Array:
-        """By how much a full turn of each joint without boundaries changes xi at some positions, (probes, n, r)."""
+        """Change of xi by a full turn of each joint without boundaries, at some positions, (probes, n, r).
+
+        It is 0 for all other joints.
+        """
         n, endless = len(self.low), ~np.array(self.task.robot.tree.prismatic) & ~np.isfinite(self.low)
         q = sample_uniform(self.domain, RULES.probes, 0)
         turned = (q + 2 * np.pi * np.diag(endless)[:, None]).reshape(-1, n)
@@ -287,32 +294,32 @@ class BoxedPhi:
 
     @property
     def winding(self) -> Flags:
-        """Joints without boundaries whose full turns change xi, (n,)."""
+        """Whether each joint has no boundaries and its full turns change xi, (n,)."""
         return np.asarray(np.abs(self.turned).max(axis=(0, 2)) > RULES.same)
 
     @property
     def even(self) -> Flags:
-        """Joints whose full turns add the same to xi at all positions, (n,); nothing, for most."""
+        """Whether a full turn of each joint adds the same to xi at all positions, (n,); True for all other joints."""
         return np.asarray(np.ptp(self.turned, axis=0).max(axis=1) < RULES.same)
 
     @property
     def has_rooms(self) -> bool:
-        """Whether the domain has conditions with expressions."""
+        """Whether the domain has conditions beyond its box that are CasADi expressions, so that `rooms` exist."""
         return self.domain.known_condition is not None
 
     def rooms(self, u: Array) -> Array:
-        """How far the conditions of the domain are from their ends, (N, k)."""
+        """Margins to the k conditions of the domain at points u (N, n), (N, k); positive inside. See `rooms_of`."""
         found: Array = self._rooms[0](self.points(u))[0]
         return found
 
     def room_slopes(self, u: Array) -> Array:
-        """Derivatives of `room` by u, (N, k, n)."""
+        """Derivatives of `rooms` by u, (N, k, n)."""
         found: Array = self._rooms[1](self.points(u))[0].reshape(len(u), -1, len(self.low))
         return found * self.domain.half_width
 
     @cached_property
     def _rooms(self) -> tuple[BlockedFunction, BlockedFunction]:
-        """q -> the rooms of the conditions, and their derivatives row by row, in a column."""
+        """Functions of q for many points: the margins (k, 1), and their derivatives by q, row by row (k n, 1)."""
         q, x = ca.SX.sym("q", len(self.low)), ca.MX.sym("q", len(self.low))
         rooms = ca.Function("rooms", [x], [rooms_of(self.domain, x)])(q)
         slopes = ca.vec(ca.jacobian(rooms, q).T)
@@ -323,7 +330,10 @@ class BoxedPhi:
 
 
 def rooms_of(domain: Domain, q: ca.MX) -> ca.MX:
-    """Smooth numbers (k, 1) that are positive just inside the conditions of a domain, and grow from 0 at their ends."""
+    """Margins (k, 1) to the conditions of a domain beyond its box, as smooth expressions of q (n, 1).
+
+    Each is 0 where its condition ends, and positive just inside. k is 0 for a box.
+    """
     clear = domain.singular_bound
     if clear is None:
         return ca.MX(0, 1) if domain.condition is None else domain.condition.pivots(q)
@@ -332,7 +342,10 @@ def rooms_of(domain: Domain, q: ca.MX) -> ca.MX:
 
 
 def _clearance(gram: ca.MX, bound: float) -> ca.MX:
-    """The product of 1 - bound^2 / sigma_i^2 over the singular values, which is 0 where the least one is the bound."""
+    """Product over i of (1 - bound^2 / sigma_i^2), where sigma_i^2 are the eigenvalues of the Gram matrix (m, m).
+
+    It is 0 where the least singular value equals the bound. Computed as det(G - bound^2 I) / det G by pivots.
+    """
     m = gram.shape[0]
     symbol = ca.SX.sym("G", m, m)
     share = ca.SX(1)
@@ -342,6 +355,7 @@ def _clearance(gram: ca.MX, bound: float) -> ca.MX:
 
 
 def _pivots(A: ca.SX) -> list[ca.SX]:
+    """Elimination pivots of a square matrix."""
     found = []
     while True:
         found.append(A[0, 0])
@@ -352,41 +366,48 @@ def _pivots(A: ca.SX) -> list[ca.SX]:
 
 @dataclass(frozen=True, eq=False)
 class InDomain:
-    """Searches all of the domain, r > 1: descents within its box from stored positions, those of nearest phi first."""
+    """Searches the whole domain, for r > 1, by descents in its box from stored positions."""
 
     boxed: BoxedPhi
     starts: Starts
 
     def search(self, targets: Array, tolerance: float) -> Array:
-        """The points of the domain (N, n) with the least error that are found for targets (N, n)."""
+        """For targets phi (N, n), the points (N, n) of the box with the least error that descents find.
+
+        Solutions outside the domain do not count. Descents start at the stored positions whose phi is nearest, and at
+        more of them for rows without a solution.
+        """
         best, error = np.empty_like(targets), np.full(len(targets), np.inf)
         for first in range(0, len(targets), RULES.rows):
             rows = np.arange(first, min(first + RULES.rows, len(targets)))
             stored = self.starts.nearest(targets[rows], RULES.stored[-1], targets.shape[1])
             best[rows] = stored[0]
-            # few starts for all rows, then more for those without a solution
+            # few starts for all rows, then more starts for rows without a solution
             for begin, end in pairwise((0, *RULES.stored)):
                 left = np.flatnonzero(error[rows] > tolerance)
                 of = np.tile(rows[left], end - begin)
                 q, found = self._descend(targets[of], stored[begin:end, left].reshape(-1, targets.shape[1]), tolerance)
-                # what is written last stays
+                # the best last, because the last assignment to a row stays
                 worst_first = np.argsort(-found, kind="stable")
                 better = worst_first[found[worst_first] < error[of[worst_first]]]
                 best[of[better]], error[of[better]] = q[better], found[better]
         return best
 
     def find_all(self, target: Array, near: Array, tolerance: float) -> Array:
-        """Solutions inside for a target (n,), some several times, (k, n); also from positions (S, n) near solutions."""
+        """Solutions inside the domain for a target phi (n,), (k, n); a solution may occur several times.
+
+        Descents start at stored positions and at `near` (S, n), positions near solutions.
+        """
         n = len(target)
         stored = [self.starts.nearest(target[None], RULES.all, count)[:, 0] for count in (n, self.boxed.m)]
-        # joints without boundaries whose turns change xi begin a turn away as well
+        # if turns of a joint without boundaries change xi, also start one turn away to both sides
         turns = list(product(*((-1, 0, 1) if winds else (0,) for winds in self.boxed.winding)))
         starts = (np.concatenate([near, *stored])[:, None] + 2 * np.pi * np.array(turns)).reshape(-1, n)
         q, error = self._descend(np.broadcast_to(target, starts.shape), starts, tolerance)
         return q[error <= tolerance]
 
     def _descend(self, targets: Array, starts: Array, tolerance: float) -> tuple[Array, Array]:
-        """Where descents end, (N, n), and the errors (N,): infinite for solutions that a condition forbids."""
+        """Descend from starts (N, n); return the ends (N, n) and their errors (N,), infinite for solutions outside."""
         with np.errstate(all="ignore"):
             most, patience, u = RULES.stored_most, RULES.stored_patience, self.boxed.of_points(starts)
             u, error = descend(self.boxed, targets, u, whole=True, most=most, patience=patience)

@@ -1,4 +1,4 @@
-"""Solvers of phi(q) = phi near a start: Newton's method for many rows, few rows and CasADi, and continuation."""
+"""Solvers of phi(q) = phi from a start: Newton's method for many rows, for few rows and in CasADi, and continuation."""
 
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -22,22 +22,22 @@ from orthocas.tools.checks import Array, Indices
 from orthocas.tools.expressions import wrap_shortest
 from orthocas.tools.interrupts import deferred
 
-ROUNDING = 1e-5  #: of phi: 1e-9 of it are 45 units in the last place
-_SINGULAR = 1e-8  # ratio of singular values of J below which the inverse map fails
+ROUNDING = 1e-5  #: share of |phi| in the scale of errors; an error of 1e-9 in that scale is 45 units in the last place
+_SINGULAR = 1e-8  # ratio of least to largest singular value up to which J counts as singular
 
 
 @dataclass(frozen=True)
 class Differences:
-    """Differences of two phi: the shorter way around for periodic components and for orientations."""
+    """Differences of two values of phi, by the shorter way around for periodic components and orientations."""
 
-    turns: Array  #: periods of the components, (n,); 0 for those that have none
-    task: Relative | None = None  #: of the first components; None for plain differences
+    turns: Array  #: periods of the components, (n,); 0 for components without a period
+    task: Relative | None = None  #: differences of task values, in the first m components; None: plain differences
 
     def __call__(self, targets: Any, values: Any) -> Any:
         """Targets - values, as NumPy rows (..., n) or CasADi columns (n, 1)."""
         if self.task is None or not self.task.turned:
             return wrap_shortest(targets - values, self.turns)
-        # orientations differ by a rotation, other components by numbers
+        # task values with an orientation by `Relative`, coordinates by wrapped differences
         m, symbolic = self.task.task.m, isinstance(values, ca.SX | ca.MX)
         pair = (targets[:m], values[:m]) if symbolic else (targets[..., :m], values[..., :m])
         first = self.task.difference(*pair)
@@ -49,20 +49,20 @@ class Differences:
 
 @dataclass(frozen=True)
 class PhiMap:
-    """phi at many points. Points are finite, values need not be."""
+    """phi and J at many points, with scaled errors. Points must be finite; values may be NaN."""
 
     phi: Callable[[Array], Array]  #: (N, n) -> (N, n)
-    jacobian: Callable[[Array], Array]  #: (N, n) -> (N, n, n): how fast phi moves, d(difference) = -J dq where it is 0
-    sizes: Array  #: sizes of the components, (n,)
-    difference: Differences  #: of targets (..., n) and values (..., n)
+    jacobian: Callable[[Array], Array]  #: (N, n) -> (N, n, n), with d(difference) = -J dq at difference 0
+    sizes: Array  #: component sizes, (n,), see `ChartParts.phi_sizes`
+    difference: Differences  #: targets (..., n) - values (..., n)
 
     def scale(self, targets: Array) -> Array:
-        """Scale of errors (N, n): the sizes of the components, and more where rounding of phi exceeds them."""
+        """Scale of errors (N, n): the component sizes, plus a share of |target| so that rounding of large phi fits."""
         scale: Array = self.sizes + ROUNDING * np.abs(targets)
         return scale
 
     def residual(self, targets: Array, q: Array) -> Array:
-        """(phi - phi(q)) / scale, (N, n), by the shorter way around."""
+        """Scaled errors (phi - phi(q)) / scale, (N, n), by the shorter way around."""
         residual: Array = self.difference(targets, self.phi(q)) / self.scale(targets)
         return residual
 
@@ -76,29 +76,29 @@ class PhiMap:
 
 
 def largest(residual: Array) -> Array:
-    """The largest entries of residuals (N, n), (N,): infinite where phi is undefined."""
+    """The largest absolute entry of each residual (N, n), (N,); infinite where phi is undefined."""
     error = np.abs(residual).max(axis=1)
     return np.where(np.isfinite(error), error, np.inf)
 
 
 @dataclass(frozen=True, slots=True)
 class NewtonRules:
-    """Numbers of Newton's method. Errors are relative to the sizes of the components."""
+    """Numbers of Newton's method. Errors are relative to the component sizes."""
 
-    iterations: int = 50  #: at most
-    patience: int = 8  #: iterations after which the error must have halved
+    iterations: int = 50  #: largest number of iterations
+    patience: int = 8  #: iterations within which the error must halve
     goal: float = 1e-12  #: error at which the iteration stops
-    keep: float = 0.1  #: J is evaluated again if a step leaves more of the error
-    decrease: float = 1e-4  #: of the error, relative to the part of the step taken
-    halvings: int = 10  #: of a step
-    brief: int = 3  #: the same where another search follows
-    solved: float = 1e-10  #: error below which only rounding stops the decrease
+    keep: float = 0.1  #: J is evaluated again after a step that leaves more than this part of the error
+    decrease: float = 1e-4  #: least relative decrease of the error for a full step; in proportion for shorter steps
+    halvings: int = 10  #: largest number of halvings of a step
+    brief: int = 3  #: the same if another search follows
+    solved: float = 1e-10  #: error below which a failed step means rounding, not divergence
     piece: int = 2048  #: matrices that a thread inverts at once
     suspicious: float = 1e6  #: |J| |J^-1| above which singular values are computed
-    few: int = 4  #: rows that are solved one by one
-    steps: int = 3  #: with the same Jacobian, of one row
-    refreshes: int = 4  #: of that Jacobian
-    tolerance: float = 1e-9  #: error of a solution in CasADi
+    few: int = 4  #: number of rows up to which they are solved one by one
+    steps: int = 3  #: steps with the same Jacobian, for one row
+    refreshes: int = 4  #: largest number of Jacobians, for one row
+    tolerance: float = 1e-9  #: largest error of a solution in CasADi
 
 
 NEWTON = NewtonRules()
@@ -113,16 +113,16 @@ _OPTIONS: dict[str, Any] = {
 
 @dataclass(frozen=True)
 class Attempt:
-    """Where a search from given starts ended."""
+    """The points at which a search from N starts ended."""
 
     q: Array  #: (N, n), finite
     residual: Array  #: (phi - phi(q)) / scale, (N, n)
     iterations: Indices  #: (N,)
-    suspicious: NDArray[np.bool_]  #: whether J may be singular there, (N,)
-    inside: NDArray[np.bool_] | None = None  #: which rows lie inside the domain for certain, (N,); None: not looked at
+    suspicious: NDArray[np.bool_]  #: whether J may be singular at q, (N,)
+    inside: NDArray[np.bool_] | None = None  #: rows known to lie inside the domain, (N,); None: not checked
 
     def replace(self, rows: Indices, other: "Attempt") -> None:
-        """Put the results of another search in some rows."""
+        """Replace the given rows by the results of another search."""
         self.q[rows], self.residual[rows] = other.q, other.residual
         self.iterations[rows], self.suspicious[rows] = other.iterations, other.suspicious
 
@@ -136,11 +136,13 @@ class LocalSolver(Protocol):
 
 
 class Newton:
-    """Newton's method with line search, which starts at finite points.
+    """Newton's method with line search, for many rows at once.
+
+    A row keeps its J^-1 while steps with it reduce the error tenfold, because J costs more than phi.
 
     Args:
         phi_map: phi and J.
-        halvings: of a step whose error does not decrease, before a row is given up.
+        halvings: largest number of halvings of a step whose error does not decrease; then the row is given up.
     """
 
     def __init__(self, phi_map: PhiMap, halvings: int = NEWTON.halvings) -> None:
@@ -148,7 +150,7 @@ class Newton:
 
     def __call__(self, targets: Array, starts: Array) -> Attempt:
         """Search from starts (N, n)."""
-        # steps of nearly singular J may overflow
+        # steps with a nearly singular J may overflow
         with np.errstate(all="ignore"):
             run = _Run(self._map, targets, starts)
             rows = np.flatnonzero(np.isfinite(run.error))
@@ -167,7 +169,7 @@ class Newton:
 
 
 class _Run:
-    """The state of all rows."""
+    """The state of `Newton` for all rows."""
 
     def __init__(self, phi_map: PhiMap, targets: Array, starts: Array) -> None:
         N, n = targets.shape
@@ -176,14 +178,14 @@ class _Run:
         self.residual = phi_map.residual(targets, self.q)
         self.error = largest(self.residual)
         self.iterations = np.zeros(N, dtype=np.int64)
-        self.stale = np.zeros(N, dtype=bool)  #: rows that need J anew
-        # rows whose J belongs to q
+        self.stale = np.zeros(N, dtype=bool)  #: rows that need a new J
+        # rows whose J was evaluated at the present q
         self._fresh = np.zeros(N, dtype=bool)
         self._inverse = np.full((N, n, n), np.nan)  # of J / scale
         self._condition = np.full(N, np.inf)
 
     def refresh(self, rows: Indices) -> None:
-        """Evaluate J at the points of some rows."""
+        """Evaluate J at the points of the given rows."""
         if rows.size:
             J = self._map.jacobian(self.q[rows]) / self._map.scale(self._targets[rows])[:, :, None]
             inverse, singular = inverses(J)
@@ -192,9 +194,12 @@ class _Run:
             self.stale[rows], self._fresh[rows] = False, True
 
     def advance(self, rows: Indices, most: int) -> NDArray[np.bool_]:
-        """Take a step in some rows, halved up to so many times until the error decreases. Returns which can go on.
+        """Take a step in the given rows, with up to `most` halvings until the error decreases.
 
-        A row whose J is from an earlier point waits for a new one instead.
+        If the full step fails with a J from an earlier point, the row is not halved, but waits for a new J.
+
+        Returns:
+            Whether each row can go on, (rows,).
         """
         inverse = self._inverse if len(rows) == len(self._inverse) else self._inverse[rows]  # copies take time
         steps = np.matmul(inverse, self.residual[rows, :, None])[:, :, 0]
@@ -206,7 +211,7 @@ class _Run:
             q = self.q[tried] + share * steps[left]
             residual = self._map.residual(self._targets[tried], q)
             before, error = self.error[tried], largest(residual)
-            # a sufficient decrease, as for line searches; slow rows get a new J
+            # accept a sufficient decrease (Armijo); rows that converge slowly get a new J
             better = error < (1 - NEWTON.decrease * share) * before
             moved = tried[better]
             self.q[moved], self.residual[moved], self.error[moved] = q[better], residual[better], error[better]
@@ -214,7 +219,7 @@ class _Run:
             self.stale[moved] = error[better] > NEWTON.keep * before[better]
             goes_on[left[better]] = True
             left = left[~better]
-            # before that, rows with an old J ask for a new one, and rows that only rounding stops end
+            # before the first halving: rows with an old J request a new one, and rows at rounding level end
             if halvings == 0:
                 waiting = ~self._fresh[rows[left]]
                 self.stale[rows[left[waiting]]] = goes_on[left[waiting]] = True
@@ -226,14 +231,14 @@ class _Run:
 
     @property
     def suspicious(self) -> NDArray[np.bool_]:
-        """Rows whose last J may be singular: |J| |J^-1| is not less than its condition number."""
+        """Whether the last J of each row may be singular, (N,): |J| |J^-1| >= its condition number is large."""
         return np.asarray(~(self._condition < NEWTON.suspicious))
 
 
 def inverses(matrices: Array) -> tuple[Array, NDArray[np.bool_]]:
-    """Inverses (N, n, n), and which matrices are singular, (N,): those get their pseudo-inverses.
+    """Inverses of matrices (N, n, n), and whether each matrix is singular, (N,).
 
-    The inverse of a matrix that is not finite is not finite either.
+    Singular matrices get their pseudo-inverses. The inverse of a matrix with NaN is NaN.
     """
     singular: NDArray[np.bool_] = np.zeros(len(matrices), dtype=bool)
     try:
@@ -243,8 +248,8 @@ def inverses(matrices: Array) -> tuple[Array, NDArray[np.bool_]]:
             pieces, run_in_threads(lambda piece: np.linalg.inv(matrices[piece]), pieces), strict=True
         ):
             found[piece] = inverse
-    except np.linalg.LinAlgError:  # it does not say which
-        # LAPACK does not say which matrix is singular
+    except np.linalg.LinAlgError:
+        # LAPACK does not say which matrix is singular: find them by their determinants
         with np.errstate(invalid="ignore"):
             singular = np.asarray(np.linalg.slogdet(matrices)[0] == 0)
         found = np.empty_like(matrices)
@@ -254,7 +259,7 @@ def inverses(matrices: Array) -> tuple[Array, NDArray[np.bool_]]:
 
 
 def _norm(matrices: Array) -> Array:
-    """Frobenius norms, (N,)."""
+    """Frobenius norms of matrices (N, n, n), (N,)."""
     norms: Array = np.sqrt(np.einsum("nij,nij->n", matrices, matrices))
     return norms
 
@@ -263,24 +268,24 @@ def _norm(matrices: Array) -> Array:
 class ContinuationRules:
     """Numbers of the continuation. Chosen on panda-wide, held on five arms (tests/charts/test_continuation.py)."""
 
-    first: float = 0.1  #: largest change of a joint in the first step [rad] or [m]
-    longest: float = 0.3  #: in any step
-    shortest: float = 1e-5  #: a line that needs shorter steps ends at a fold
-    bent: float = 0.3  #: largest miss of the linear prediction, relative to the part of the way taken
-    straight: float = 0.1  #: the miss up to which the next step may be longer
-    rounding: float = 1e-9  #: error below which only rounding may stop the decrease
-    most: int = 400  #: steps
+    first: float = 0.1  #: [rad] or [m] largest change of a joint in the first step
+    longest: float = 0.3  #: [rad] or [m] largest change of a joint in any step
+    shortest: float = 1e-5  #: [rad] or [m] a row that needs shorter steps ends, at a fold
+    bent: float = 0.3  #: largest error of the linear prediction, relative to the predicted change
+    straight: float = 0.1  #: relative error of the prediction up to which the next step may be longer
+    rounding: float = 1e-9  #: error of phi below which a failed step means rounding
+    most: int = 400  #: largest number of steps
 
 
 CONTINUATION = ContinuationRules()
 
 
 class Continuation:
-    """Follows phi(q(s)) = phi - (1 - s) e from a start with the error e = phi - phi(q), to s = 1.
+    """Follows the straight line phi(q(s)) = phi - (1 - s) e from a start at s = 0, with e = phi - phi(start), to s = 1.
 
-    Errors of orientations and of periodic coordinates are the shorter way around. Each step goes along J^-1 e; it is
-    halved until phi follows the line and det J keeps its sign, so q stays on the sheet of its start. It finds nothing
-    where the line meets a fold first, or where e is not the way that the arm can take.
+    Errors of orientations and of periodic coordinates go the shorter way around. Each step goes along J^-1 e. It is
+    halved until phi follows the line and det J keeps its sign, so q does not cross a fold. No solution is found if the
+    line meets a fold before s = 1, or if the arm can only go the longer way around.
     """
 
     def __init__(self, phi_map: PhiMap) -> None:
@@ -295,7 +300,7 @@ class Continuation:
             h, iterations = np.full(len(q), CONTINUATION.first), np.zeros(len(q), dtype=np.int64)
             left = np.flatnonzero(np.isfinite(error) & np.isfinite(step).all(axis=1))
             for _ in range(CONTINUATION.most):
-                # rows end at the target, or where steps get too short
+                # rows end at the target, or when steps get too short
                 left = left[(error[left] > NEWTON.goal) & (h[left] > CONTINUATION.shortest)]
                 if not left.size:
                     break
@@ -303,7 +308,7 @@ class Continuation:
                 share = np.minimum(1.0, h[left] / np.abs(step[left]).max(axis=1))
                 new = q[left] + share[:, None] * step[left]
                 after = self._map.residual(targets[left], new)
-                # it counts if phi moved along the line, and det J kept its sign
+                # accept it if phi moved along the line and det J kept its sign
                 miss = largest(after - (1 - share[:, None]) * residual[left]) / (share * error[left])
                 onward, side = self._steps(targets[left], new, after)
                 rounded = (share == 1) & (error[left] < CONTINUATION.rounding)
@@ -313,7 +318,7 @@ class Continuation:
                 q[moved], residual[moved], step[moved] = new[good], after[good], onward[good]
                 error[moved] = largest(after[good])
                 iterations[moved] += 1
-                # longer steps where the line is nearly straight, shorter ones where a step failed
+                # longer steps if the prediction was good, half the step if it failed
                 longer = miss[good] <= CONTINUATION.straight
                 h[moved] = np.where(longer, np.minimum(1.5 * h[moved], CONTINUATION.longest), h[moved])
                 h[left[~good]] /= 2
@@ -321,7 +326,7 @@ class Continuation:
             return Attempt(q, residual, iterations, np.ones(len(q), dtype=bool))
 
     def _steps(self, targets: Array, q: Array, residual: Array) -> tuple[Array, Indices]:
-        """J^-1 e at points (N, n), and the signs of det J, (N,)."""
+        """Steps J^-1 e at points q (N, n) with scaled errors `residual`, (N, n), and the signs of det J, (N,)."""
         J = self._map.jacobian(q) / self._map.scale(targets)[:, :, None]
         steps = (inverses(J)[0] @ residual[:, :, None])[:, :, 0]
         return steps, np.sign(np.linalg.slogdet(J)[0]).astype(np.int64)
@@ -329,7 +334,10 @@ class Continuation:
 
 @dataclass(frozen=True)
 class OwnInverse:
-    """The inverse map that belongs to the coordinates; the start selects turns and sheets."""
+    """Solver for grown coordinates, by their own inverse map.
+
+    If several q have the same phi, the start selects the number of full turns and the sheet of the leaf.
+    """
 
     coordinates: InvertibleMap
     phi_map: PhiMap
@@ -348,28 +356,28 @@ class OwnInverse:
 class PointFunctions:
     """The two functions of a chart that `PointSolver` calls."""
 
-    inverted: ca.Function  #: q -> phi, H = J^-1, and |D^-1 J| |H D| with the sizes D of the components
-    chord: ca.Function  #: q, phi, H, target -> q and phi after 3 steps, and |residual| at each of the 4 points
-    turning: tuple[int, ...] = ()  #: joints that turn without end, as in `Problem.turning`
-    turns: tuple[float, ...] = ()  #: periods of the components, as in `Differences`
+    inverted: ca.Function  #: q -> phi, H = J^-1, and |D^-1 J| |H D| with the component sizes D
+    chord: ca.Function  #: q, phi, H, target -> q and phi after 3 steps with H, and |residual| at each of the 4 points
+    turning: tuple[int, ...] = ()  #: indices of joints without boundaries that turn, as in `Problem.turning`
+    turns: tuple[float, ...] = ()  #: periods of the components of phi, as in `Differences`
 
     @classmethod
     def of(
         cls, phi: ca.Function, jacobian: ca.Function, sizes: Array, difference: Differences, turning: tuple[int, ...]
     ) -> "PointFunctions":
-        """Build from phi and J of a column q (n, 1), and the sizes and differences of phi, as in `PhiMap`."""
+        """Build the functions from phi and J of a column q (n, 1), and from sizes and differences as in `PhiMap`."""
         n = len(sizes)
-        # J^-1, and the product of the norms of D^-1 J and its inverse; by QR, so NaN for singular J
+        # J^-1, and the product of the norms of D^-1 J and its inverse; a singular J gives NaN
         J, D = ca.SX.sym("J", n, n), ca.repmat(ca.DM(sizes), 1, n)
         own = ca.solve(J, ca.SX.eye(n))
         inversion = ca.Function("inversion", [J], [own, ca.norm_fro(J / D) * ca.norm_fro(own * D.T)])
         q, known, target = (ca.MX.sym(name, n) for name in ("q", "phi", "target"))
         inverted = dense_function("inverted", [q], [phi(q), *inversion.call([jacobian(q)])])
-        # steps with the same J^-1
+        # chord steps: several steps with the same J^-1
         H = ca.MX.sym("H", n, n)
         scale = ca.DM(sizes) + ROUNDING * ca.fabs(target)
         now, value, left = q, known, difference(target, known)
-        # norm_inf drops NaN
+        # the 2-norm, because CasADi's norm_inf ignores NaN
         errors = [ca.norm_2(left / scale)]
         for _ in range(NEWTON.steps):
             now = now + H @ left
@@ -380,23 +388,23 @@ class PointFunctions:
         return cls(inverted, chord, turning, tuple(np.asarray(difference.turns, dtype=float).tolist()))
 
     def distance(self, phi: Array, target: Array) -> float:
-        """|target - phi| relative to the sizes of the components, by the shorter way around."""
+        """|target - phi| relative to the component sizes, by the shorter way around, a number."""
         n = len(phi)
         return float(self.chord(np.zeros(n), phi, np.zeros((n, n)), target)[2][0])
 
 
 class PointSolver:
-    """Solves phi(q) = target near a start; each solver has its own scratch memory, and belongs to one thread.
+    """Solves phi(q) = target from a start, for one row at a time.
 
-    `q` and `target` are its inputs, (n,), and `phi` is that of q. After steps, `reached` and `errors` tell where they
-    ended.
+    The caller writes `q` and `target`, (n,), in place. `phi` is phi(q) of the last refresh. `step` writes its end to
+    `reached`, and the errors along the way to `errors`. A solver has its own buffers, so it belongs to one thread.
     """
 
     def __init__(self, functions: PointFunctions) -> None:
         n = functions.chord.numel_out(0)
         self.q, self.phi, self.target, self.reached, self._phi_reached = np.empty((5, n))
         self.errors, self.condition = np.empty(NEWTON.steps + 1), np.empty(1)
-        self.iterations = 0  #: of the last solution
+        self.iterations = 0  #: number of steps of the last `solve`
         self._H = np.empty(n * n)
         self._refresh = Bound(functions.inverted, [self.q], [self.phi, self._H, self.condition])
         results = [self.reached, self._phi_reached, self.errors]
@@ -409,19 +417,19 @@ class PointSolver:
         return self._H.reshape(n, n).T.copy()
 
     def refresh(self) -> bool:
-        """Evaluate phi and J at q. Returns whether J is regular."""
+        """Evaluate phi and J at q; return whether J is regular."""
         self._refresh.run()
         return bool(self.condition[0] < NEWTON.suspicious)
 
     def step(self) -> bool:
-        """Take steps from q with the last J. Returns whether all of them reduced the error; q stays."""
+        """Compute chord steps from q with the last J, without moving q; return whether each reduced the error."""
         self._step.run()
-        # whether errors fall until they are rounding
+        # at rounding level, the error need not fall any more
         errors = self.errors.tolist()
         return all(after < before or after <= NEWTON.goal for before, after in pairwise(errors))
 
     def shorten(self) -> bool:
-        """Halve the steps, with a fresh J, until they reduce the error; return whether they do."""
+        """Halve H until steps with it reduce the error; return whether they do. To be called with a fresh J."""
         for _ in range(NEWTON.halvings):
             self._H *= 0.5
             if self.step():
@@ -429,13 +437,13 @@ class PointSolver:
         return False
 
     def accept(self) -> None:
-        """Move q to where the last steps ended."""
+        """Move q to the end of the last steps."""
         self.q[:], self.phi[:] = self.reached, self._phi_reached
 
     def solve(self) -> bool:
-        """Solve for the target from q. Returns whether the error fell to rounding; then q is the solution."""
+        """Solve for the target from q; return whether the error fell to rounding, so that q is a solution."""
         self.iterations = 0
-        # some steps with each Jacobian
+        # `NEWTON.steps` chord steps with each Jacobian
         for _ in range(NEWTON.refreshes):
             if not self.refresh() or not self.step():
                 return False
@@ -447,11 +455,11 @@ class PointSolver:
 
 
 class FewRows:
-    """A local solver that takes few rows one by one, and the others, or those that fail, to another solver."""
+    """A local solver for few rows, one by one. It passes many rows, and rows that fail, to another solver."""
 
     def __init__(self, phi_map: PhiMap, functions: PointFunctions, other: LocalSolver) -> None:
         self._map, self._functions, self._other = phi_map, functions, other
-        self._spare: list[PointSolver] = []  # that nobody uses now
+        self._spare: list[PointSolver] = []  # solvers that no thread uses now
 
     def __call__(self, targets: Array, starts: Array) -> Attempt:
         """Search from starts (N, n)."""
@@ -459,7 +467,7 @@ class FewRows:
             return self._other(targets, starts)
         steps, sure = np.zeros(len(targets), dtype=np.int64), np.zeros(len(targets), dtype=bool)
         attempt = Attempt(np.empty(targets.shape), np.empty(targets.shape), steps, sure)
-        # otherwise CasADi turns Ctrl-C into a RuntimeError, or swallows it
+        # defer Ctrl-C, because CasADi turns it into a RuntimeError or loses it
         with deferred():
             try:
                 solver = self._spare.pop()
@@ -479,10 +487,10 @@ class FewRows:
 
 
 class Bound:
-    """A function on arrays that stay in place: `run()` evaluates it."""
+    """A CasADi function bound to fixed input and output arrays; `run()` evaluates it without copies."""
 
     def __init__(self, function: ca.Function, inputs: list[Array], outputs: list[Array]) -> None:
-        # the stubs of set_arg and set_res ask for a size, the methods take none
+        # `Any`, because the type stubs of set_arg and set_res require a size, which the methods do not take
         buffer: Any
         buffer, run = function.buffer()
         for i, array in enumerate(inputs):
@@ -494,7 +502,7 @@ class Bound:
 
 
 def inverse_function(phi: ca.Function, sizes: Array, difference: Differences) -> ca.Function:
-    """phi (n, 1), q_start (n, 1) -> q (n, 1) with phi(q) = phi, NaN where Newton's method finds none from q_start."""
+    """CasADi function phi, q_start (n, 1) -> q (n, 1) with phi(q) = phi, or NaN if Newton's method finds none."""
     n = len(sizes)
     q, target, start = (ca.MX.sym(name, n) for name in ("q", "phi", "q_start"))
 
@@ -503,50 +511,49 @@ def inverse_function(phi: ca.Function, sizes: Array, difference: Differences) ->
 
     solve = ca.rootfinder("solve", "newton", {"x": q, "p": target, "g": residual(q)}, _OPTIONS)
     found = solve(start, target)
-    failed = ca.if_else(
-        ca.norm_2(residual(found)) <= NEWTON.tolerance, 0.0, np.nan
-    )  # a constant, so without derivatives
+    # adding 0 or NaN marks failures without changing the derivatives
+    failed = ca.if_else(ca.norm_2(residual(found)) <= NEWTON.tolerance, 0.0, np.nan)
     return ca.Function("inverse", [target, start], [found + failed], ["phi", "q_start"], ["q"])
 
 
 @dataclass(frozen=True, slots=True)
 class StartRules:
-    """Numbers of starts. Chosen and held on the ready charts, other seeds (benchmarks/round_trips.py)."""
+    """Numbers of `Starts`. Chosen on the ready charts, held there with other seeds (benchmarks/round_trips.py)."""
 
-    points: int = 4096  #: of the table of stored positions
-    seed: int = 0  #: of these
-    degrees: tuple[int, ...] = (3, 2, 1)  #: of the rough inverse: the first one with so few terms
-    most_terms: int = 500
-    overshoot: float = 1.2  #: beyond the values of the table, polynomials are not trusted
+    points: int = 4096  #: number of stored positions
+    seed: int = 0  #: seed of the stored positions
+    degrees: tuple[int, ...] = (3, 2, 1)  #: degrees of the polynomial inverse; the first with few enough terms is used
+    most_terms: int = 500  #: largest number of its terms
+    overshoot: float = 1.2  #: values of phi are clipped to this multiple of their stored range
 
 
 STARTS = StartRules()
 
 
 class Starts:
-    """Joint positions from which Newton's method may reach phi(q) = phi.
+    """Starts for Newton's method: a polynomial approximation of the inverse, and stored positions.
 
-    The rough inverse is a polynomial q(phi), fitted to 4,096 points of the domain by least squares. Both coordinates
-    and task are smooth, so it is much closer than the centre of the domain. It takes 0.1 s once for each chart.
+    The polynomial q(phi) is fitted by least squares to 4,096 stored positions of the domain, once for each chart in
+    0.1 s. Task and coordinates are smooth, so it is much closer to a solution than the centre of the domain.
     """
 
     def __init__(self, phi_map: PhiMap, domain: Domain) -> None:
         self._map, self._domain = phi_map, domain
 
     def guess(self, targets: Array) -> Array:
-        """The rough inverse at targets (N, n), moved into the box of the domain, (N, n)."""
+        """The polynomial inverse at targets (N, n), clipped to the box of the domain, (N, n)."""
         centre, half_width = self._domain.centre, self._domain.half_width
         q = _terms(self._normalised(targets), self._degree) @ self._coefficients
         guess: Array = np.clip(q, centre - half_width, centre + half_width)
         return guess
 
     def nearest(self, targets: Array, count: int, components: int) -> Array:
-        """The points of the table whose phi is nearest to targets (N, n), nearest first, (count or fewer, N, n).
+        """The stored positions whose phi is nearest to targets (N, n), nearest first, (count or fewer, N, n).
 
         Args:
             targets: values of phi.
-            count: points for each target.
-            components: how many components of phi count, the first ones.
+            count: number of positions for each target.
+            components: number of components of phi that are compared: m for x alone, n for phi.
         """
         points = self._table[0]
         order = self._trees[components].query(self._places(targets, components), range(1, min(count, len(points)) + 1))[
@@ -557,11 +564,14 @@ class Starts:
 
     @cached_property
     def _trees(self) -> BuiltOnUse[int, Any]:
-        """Search trees of places of the table, by the number of components that count."""
+        """k-d trees of the stored values of phi, by the number of components that are compared."""
         return BuiltOnUse(lambda components: scipy.spatial.cKDTree(self._places(self._table[1], components)))
 
     def _places(self, phi: Array, components: int) -> Array:
-        """Numbers (N, k) that are near one another where the first components of phi (N, n) are."""
+        """Vectors (N, k) whose distances measure how near the first components of phi (N, n) are.
+
+        Components are normalised by their ranges. Orientations are embedded without a seam, see `Relative.embed`.
+        """
         normalised, relative = self._normalised(phi)[:, :components], self._map.difference.task
         if relative is None or not relative.turned:
             return normalised
@@ -571,7 +581,7 @@ class Starts:
 
     @cached_property
     def _table(self) -> tuple[Array, Array]:
-        """Points of the domain where phi is defined, and phi, (K, n) each."""
+        """The stored positions: points of the domain where phi is defined, and phi there, (K, n) each."""
         points = sample_boundary_weighted(self._domain, STARTS.points, STARTS.seed)
         phi = self._map.phi(points)
         known = np.isfinite(phi).all(axis=1)
@@ -581,24 +591,25 @@ class Starts:
 
     @cached_property
     def _range(self) -> tuple[Array, Array]:
-        """Middle and half of the range of phi over the domain, (n,) each."""
+        """Centre and half-width of the range of phi over the stored positions, (n,) each."""
         low, high = self._table[1].min(axis=0), self._table[1].max(axis=0)
         return (low + high) / 2, np.where(high > low, (high - low) / 2, 1.0)
 
     @cached_property
     def _coefficients(self) -> Array:
-        """Coefficients of the rough inverse, (terms, n)."""
+        """Coefficients of the polynomial inverse, (terms, n)."""
         points, phi = self._table
         found = np.linalg.lstsq(_terms(self._normalised(phi), self._degree), points, rcond=None)[0]
         return np.asarray(found, dtype=float)
 
     @property
     def _degree(self) -> int:
+        """Degree of the polynomial inverse."""
         n = len(self._domain.centre)
         return next((degree for degree in STARTS.degrees if comb(n + degree, degree) <= STARTS.most_terms), 1)
 
     def _normalised(self, phi: Array) -> Array:
-        """Values of phi (N, n) in the range [-1, 1], or a little beyond."""
+        """Scale phi (N, n) to [-1, 1] over the stored range, and clip it a little beyond."""
         middle, half = self._range
         return np.clip((phi - middle) / half, -STARTS.overshoot, STARTS.overshoot)
 
@@ -606,7 +617,7 @@ class Starts:
 def _terms(u: Array, degree: int) -> Array:
     """All monomials of the columns of u (N, n) up to a degree, (N, terms)."""
     columns = np.ascontiguousarray(u.T)
-    # index of the last factor, product
+    # monomials of one degree, each with the index of its last factor
     level = [(0, np.ones(len(u)))]
     terms = [level[0][1]]
     for _ in range(degree):
