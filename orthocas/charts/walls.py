@@ -1,4 +1,4 @@
-"""What stops a motion: the boundaries of a domain and contacts, and what trackers keep clear of."""
+"""What stops a motion: the boundaries of a domain, and contacts; and the clearance that trackers keep from contacts."""
 
 from __future__ import annotations
 
@@ -19,26 +19,26 @@ from orthocas.tools.expressions import wrap_shortest
 class ClearanceRules:
     """Numbers of walls, and of trackers that keep clear of contacts."""
 
-    margin: float = 0.01  #: [m], default of the distance that is kept
-    largest: float = 10.0  #: [m], of distances to keep
-    zone: float = 3.0  #: margins: nearer pairs may approach by a part of their distance only
-    fall: float = 0.5  #: of the distance above the margin, in a call
-    between: float = 0.5  #: of the margin that is kept between postures
-    halvings: int = 6  #: of a step that comes too near
-    rounds: int = 4  #: of the search for xi in a call
-    sweeps: int = 8  #: over the pairs, of a projection onto what they allow
-    movable: float = 1e-3  #: [m per unit of xi], of pairs that xi can move
-    settled: float = 1e-6  #: of xi, relative to the wished change: the search has ended
-    at_limit: float = 1e-9  #: half-widths: boundaries closer to a joint limit are that limit
-    grazing: float = 1e-4  #: [rad] or [m]: shorter steps are not checked for contacts between their ends
-    depth: float = 1e-4  #: [m] of contacts that may be passed between two steps
+    margin: float = 0.01  #: [m] default of the distance to contacts that is kept
+    largest: float = 10.0  #: [m] upper bound of margin and `avoid`
+    zone: float = 3.0  #: [margins] distance below which a call may use up only a part of the distance
+    fall: float = 0.5  #: that part: how much of the distance above the margin a call may use up
+    between: float = 0.5  #: part of the margin that is kept between two postures
+    halvings: int = 6  #: number of postures tried on a step that comes too near, each half as far as the one before
+    rounds: int = 4  #: largest number of changes of xi in a call
+    sweeps: int = 8  #: passes over the pairs in a projection of the change of xi
+    movable: float = 1e-3  #: [m per unit of xi] rate of a distance below which xi does not count as moving the pair
+    settled: float = 1e-6  #: change of xi, relative to the desired change, at which the rounds end
+    at_limit: float = 1e-9  #: [half-widths] a boundary that close to a joint limit counts as that limit
+    grazing: float = 1e-4  #: [rad] or [m] shorter steps are not checked for contacts between their ends
+    depth: float = 1e-4  #: [m] depth up to which a contact between two steps may be missed
 
 
 RULES = ClearanceRules()
 
 
 def require_collisions(collisions: object, tree: KinematicTree) -> None:
-    """Raise InvalidValueError for what is neither None nor a collision model of the robot of a tree."""
+    """Raise InvalidValueError unless `collisions` is None or a collision model of the robot of a tree."""
     if collisions is not None:
         require_kind("collisions", collisions, Collisions)
         assert isinstance(collisions, Collisions)
@@ -47,13 +47,13 @@ def require_collisions(collisions: object, tree: KinematicTree) -> None:
 
 @dataclass(frozen=True)
 class Stop:
-    """What ends a motion, and where."""
+    """What stops a motion, and where."""
 
     kind: StopKind
     joint: str = ""  #: name of the joint, for JOINT
-    value: float = np.nan  #: position of that joint [rad] or [m], or what a condition of the domain bounds
-    is_limit: bool = False  #: whether the boundary of the domain is the limit of the joint
-    condition: str = ""  #: in one line, for conditions of the domain; the pair, for contacts
+    value: float = np.nan  #: position of that joint [rad] or [m], or value of the quantity that a condition bounds
+    is_limit: bool = False  #: whether the boundary of the domain is also a joint limit
+    condition: str = ""  #: the condition of the domain in one line, or the pair of a contact
 
     def __str__(self) -> str:
         if self.kind is StopKind.JOINT:
@@ -72,7 +72,7 @@ class Stop:
 
     @property
     def brief(self) -> str:
-        """The same in a few words."""
+        """What stops the motion, in a few words."""
         if self.kind is StopKind.JOINT:
             return f"{self.joint} at {'its limit ' if self.is_limit else ''}{self.value:.4g}"
         return {
@@ -86,26 +86,26 @@ class Stop:
 
 
 class Walls:
-    """The boundaries of a problem's domain as functions that are positive inside.
+    """The boundaries of a problem's domain as numbered functions of q that are positive inside.
 
-    They are (q_i - low_i) and (high_i - q_i), divided by the half-width of the domain, for every joint; then what the
-    domain itself names as its `walls`; then the distance to a contact, if there are solids to hit.
+    They are, in this order: (q_i - low_i) for all joints, then (high_i - q_i), both divided by the half-widths; the
+    conditions that the domain lists as `Domain.walls`; and with a collision model, the distance to a contact.
     """
 
     def __init__(self, problem: Problem, collisions: Collisions | None = None) -> None:
         domain = problem.domain
         self._domain, self._robot, self._collisions = domain, problem.robot, collisions
         self._low, self._high = domain.bounds
-        self.solid = collisions is not None  #: whether there is something to hit
+        self.solid = collisions is not None  #: whether contacts are checked
         self._curved = domain.walls
         require_collisions(collisions, problem.robot.tree)
         if collisions is not None:
             self._curved = (*domain.walls, Wall(StopKind.CONTACT, lambda q: float(collisions.distance(q).distance)))
         endless = np.isinf(self._low) & ~np.array(problem.robot.tree.prismatic)
-        self.turning = endless  #: unbounded revolute joints, (n,): they are at the same place after a full turn
+        self.turning = endless  #: whether each joint is revolute and unbounded, (n,)
 
     def values(self, q: Array) -> Array:
-        """All functions at one joint position (n,), positive inside; infinite for unbounded joints."""
+        """Values of all functions at q (n,), positive inside; infinite for unbounded joints, -1 for NaN."""
         width = self._domain.half_width
         rooms = np.array([wall.room(q) for wall in self._curved])
         parts = [
@@ -120,7 +120,7 @@ class Walls:
         return bool(((q >= self._low) & (q <= self._high)).all())
 
     def stop(self, k: int, q: Array) -> Stop:
-        """What the k-th function stands for, at q (n,)."""
+        """The `Stop` of the k-th function at q (n,)."""
         n = len(q)
         if k >= 2 * n:
             wall = self._curved[k - 2 * n]
@@ -135,9 +135,10 @@ class Walls:
         return Stop(StopKind.JOINT, self._robot.joint_names[i], float(boundary[i]), at_limit)
 
     def may_touch(self, q: Array, t: Array, new: Array, onward: Array) -> bool:
-        """Whether a contact deeper than a tolerance may lie on an arc between joint positions (n,) with end tangents.
+        """Whether a contact deeper than `RULES.depth` may lie on the arc from q with tangent t to `new` with `onward`.
 
-        An arc whose tangent turns by an angle a is no farther from its chord c than (c / 2) tan(a / 2).
+        The check is along the chord. An arc whose tangent turns by an angle a is at most (c / 2) tan(a / 2) away from
+        its chord of length c.
         """
         chord = float(np.linalg.norm(new - q))
         if self._collisions is None or chord < RULES.grazing:
@@ -146,26 +147,26 @@ class Walls:
         return self._collisions.find_contact(np.array([q, new]), -RULES.depth, bend) is not None
 
     def worst(self, q: Array) -> Stop:
-        """The boundary that q (n,) has crossed farthest, or is nearest to."""
+        """The boundary that q (n,) violates most, or to which it is nearest."""
         return self.stop(int(np.argmin(self.values(q))), q)
 
     def gap(self, q: Array, start: Array) -> Array:
-        """q - start (n,), up to full turns of unbounded revolute joints."""
+        """q - start (n,), wrapped to half a turn for unbounded revolute joints."""
         return np.asarray(wrap_shortest(q - start, 2 * np.pi * self.turning))
 
 
 class Clearance:
     """Keeps a stream of postures at a distance from contacts.
 
-    A step may lower the least distance d from above the margin m only to m + (min(d, 3 m) - m) / 2, so that it comes to
-    rest at the margin, and never while it is below. The way of a step is checked between its ends, by conservative
-    advancement, for half of the margin, or of d if that is less.
+    Let d be the least distance of all pairs and m the margin. If d > m, a step may lower it to
+    m + (min(d, 3 m) - m) / 2, so that the stream comes to rest at the margin. If d <= m, a step may not lower it.
+    Between its ends, a step is checked by conservative advancement for half of the margin, or of d if that is less.
 
     Args:
-        collisions: of the robot of the tree.
+        collisions: collision model of the robot of the tree.
         tree: the robot.
-        margin: [m].
-        avoid: the distance below which xi gives way, > margin [m]; None if it does not.
+        margin: distance that is kept [m]; None: 0.01.
+        avoid: distance below which xi yields, > margin [m]; None: xi does not yield.
 
     Raises:
         InvalidValueError: if a distance is out of range, or the collisions are those of another robot.
@@ -181,7 +182,7 @@ class Clearance:
         if self.avoid is not None and not self.margin < self.avoid < RULES.largest:
             raise InvalidValueError("avoid", avoid, f"a distance above the margin of {self.margin:g} m")
         self._q = np.full(tree.n, np.nan)
-        #: of the least distance at that posture: the value, or a lower bound above all that is kept
+        #: least distance at that posture, and whether it is exact; otherwise it is a lower bound above what is kept
         self._least, self._exact = -np.inf, False
 
     @classmethod
@@ -191,17 +192,17 @@ class Clearance:
         """The clearance of a tracker; None without a collision model.
 
         Raises:
-            InvalidValueError: if a distance is given without one.
+            InvalidValueError: if a distance is given without a collision model.
         """
         if collisions is not None:
             return cls(collisions, tree, margin, avoid)
         for name, value in (("margin", margin), ("avoid", avoid)):
             if value is not None:
-                raise InvalidValueError(name, value, "collisions with it")
+                raise InvalidValueError(name, value, "None, because no collision model is given")
         return None
 
     def copy(self) -> Clearance:
-        """Another one for another stream."""
+        """A clearance with the same settings for another stream."""
         return Clearance(self.collisions, self._tree, self.margin, self.avoid)
 
     def start(self, q: Array) -> None:
@@ -213,11 +214,11 @@ class Clearance:
         found = self.collisions.distance(q)
         if found.distance <= 0:
             pair = f"'{found.pair[0]}' and '{found.pair[1]}'"
-            raise InvalidValueError("q", f"a posture where {pair} touch", "one without a contact")
+            raise InvalidValueError("q", f"a posture where {pair} touch", "a posture without a contact")
         self._q, self._least, self._exact = q.copy(), float(found.distance), True
 
     def measure(self, q: Array) -> float:
-        """The least distance at q (n,), or a lower bound of it that is more than what is kept."""
+        """The least distance at q (n,) [m], or a lower bound of it if that already exceeds all distances to be kept."""
         if np.array_equal(q, self._q) and self._exact:
             return self._least
         bound = self._least - self._reach(q - self._q)
@@ -225,15 +226,20 @@ class Clearance:
         return bound if bound > kept else float(self.collisions.distance(q).distance)
 
     def limit(self, q: Array, new: Array) -> tuple[Array, float]:
-        """The farthest of some postures on the straight way from q to new (n,) that keeps clear, and its fraction."""
+        """Shorten a step from q to `new` (n,) until it keeps clear.
+
+        Returns:
+            A posture (n,) on the straight line between them, and its fraction of the step: 1, 1/2, 1/4, ..., or 0.
+        """
         least = self._least if np.array_equal(q, self._q) else self.measure(q)
         fraction = 1.0
-        # halve the way until a posture on it keeps clear
+        # halve the step until it keeps clear
         for _ in range(RULES.halvings):
             place = new if fraction == 1.0 else q + fraction * (new - q)
             value = self.measure(place)
             if value >= float(self.floor(np.array(least))):
-                # The distances at both ends may not vouch for those between; then the way is searched for a contact.
+                # Distances change by at most `_reach`, so those at both ends may vouch for those between. If they do
+                # not, search the step for a contact.
                 kept = RULES.between * min(self.margin, least, value)
                 vouched = (least + value - self._reach(place - q)) / 2 > kept
                 if vouched or self.collisions.find_contact(np.array([q, place]), kept) is None:
@@ -241,24 +247,28 @@ class Clearance:
                     self._q, self._least, self._exact = place.copy(), value, exact
                     return place, fraction
             fraction /= 2
-        # nowhere on the way: stay
+        # no posture on the step keeps clear: stay
         self._q, self._least = q.copy(), least
         return q, 0.0
 
     def hold(self, q: Array) -> None:
-        """The stream goes on from q (n,), not from where the last step was allowed to go."""
+        """Continue from q (n,) instead of the posture that `limit` returned last."""
         if not np.array_equal(q, self._q):
             least = self.measure(q)
             self._q, self._least, self._exact = q.copy(), least, False
 
     def floor(self, distance: Array) -> Array:
-        """How near pairs at these distances may come in a call."""
+        """Least distances [m] to which pairs at these distances may come in a call."""
         above = np.minimum(distance, RULES.zone * self.margin) - self.margin
         floor = np.where(above > 0, self.margin + (1 - RULES.fall) * above, distance)
         return np.asarray(floor)
 
     def list_rows(self, q: Array, limit: Array) -> tuple[Indices, Array]:
-        """Pairs of parts that steps from q (n,) of at most `limit` (n,) may bring too near, and their floors."""
+        """Pairs of parts that a step from q (n,) of at most `limit` (n,) may bring below the margin.
+
+        Returns:
+            Their indices, and the least distances to which they may come, see `floor`.
+        """
         reach = self.collisions.rates @ limit
         index = self.collisions.list_near_parts(q, self.margin + reach)
         distance = self.collisions.measure_parts(q, index)[0]
@@ -266,25 +276,25 @@ class Clearance:
         return index[near], self.floor(distance[near])
 
     def yield_to(self, q: Array, slopes: Array, wish: Array) -> Array:
-        """A change of xi (r,) near a wished one that keeps pairs at `avoid`, to first order.
+        """A change of xi (r,) near a desired one that keeps pairs at least `avoid` apart, to first order.
 
-        With one pair it is the nearest.
+        With one pair, it is the nearest such change.
 
         Args:
             q: posture (n,).
             slopes: dq/dxi with x held, (n, r).
-            wish: wished change of xi, (r,).
+            wish: desired change of xi, (r,).
 
         Source:
             Cyclic projections onto half-spaces (Kaczmarz); ours.
         """
         assert self.avoid is not None
-        # pairs that the wished change may bring nearer than `avoid`
+        # pairs that the desired change may bring nearer than `avoid`
         near = self.collisions.find_near(q, self.avoid + self._reach(slopes @ wish))
         rates = near.gradient @ slopes
         squares = np.einsum("pr,pr->p", rates, rates)
         change = wish.copy()
-        # one pair after the other, by Kaczmarz's projections
+        # project onto the half-space that each pair allows, one pair after the other
         for _ in range(RULES.sweeps):
             for rate, square, room in zip(rates, squares, near.distance - self.avoid, strict=True):
                 short = -room - float(rate @ change)
@@ -293,5 +303,5 @@ class Clearance:
         return change
 
     def _reach(self, change: Array) -> float:
-        """How much a change of q (n,) can change any distance, at most."""
+        """Upper bound [m] of how much a change of q (n,) can change any distance."""
         return float((self.collisions.rates @ np.abs(change)).max(initial=0.0))

@@ -144,7 +144,7 @@ def test_bad_distances_and_starts_are_refused(arm: tuple[oc.Robot, oc.Chart]) ->
         chart.tracker(HOME, collisions=free, margin=-1.0)
     with pytest.raises(InvalidValueError, match="above the margin of 0.01 m"):
         chart.tracker(HOME, collisions=free, avoid=0.005)
-    with pytest.raises(InvalidValueError, match="collisions with it"):
+    with pytest.raises(InvalidValueError, match="no collision model is given"):
         chart.tracker(HOME, avoid=0.05)
 
 
