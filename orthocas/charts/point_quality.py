@@ -1,4 +1,4 @@
-"""Quality of a chart at single points, and the search for its worst ones."""
+"""Quality of a chart at single joint positions, and the search for the worst of them."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -24,26 +24,26 @@ from orthocas.tools.json import collect_attributes
 
 @dataclass(frozen=True, slots=True)
 class WorstRules:
-    """Numbers of the quality at points, and of descents to the worst ones."""
+    """Numbers of the quality at points, and of the search for the worst points (`descended`)."""
 
-    chunk: int = 500_000  #: entries of (n, n) matrices at joint positions evaluated at once
-    near_the_end: float = 0.1  #: cos(angle / 2) of turns beyond which rounding of J_x shows
-    longest: float = 1e100  #: squares of longer gradients overflow: they have no value
-    candidates: int = 6000  #: points from which descents may start
-    descents: int = 300  #: from the worst of them
-    steps: int = 15  #: of each
-    kept: int = 60  #: the worst of these go on together
-    most_pairs: int = 100  #: of steps of those
-    quiet_pairs: int = 20  #: of steps in turn that gain less than `gain`, after which they end
-    gain: float = 1e-4
-    first_step: float = 0.3  #: half-widths
-    last_step: float = 1e-4  #: half-widths
-    moved: float = 0.4  #: fraction of the joints that move in a step
-    leaders: float = 0.2  #: fraction of the descents that others follow
-    scale: tuple[float, float] = (0.4, 1.0)  #: of steps towards them, least and largest
-    exchanged: tuple[float, ...] = (0.2, 0.5, 0.9)  #: fractions of the joints that move in these
+    chunk: int = 500_000  #: matrix entries (positions times n^2) evaluated at once, to bound memory
+    near_the_end: float = 0.1  #: cos(angle / 2) of an orientation below which J_x is inaccurate, near half a turn
+    longest: float = 1e100  #: longer gradients count as undefined, because their squares overflow
+    candidates: int = 6000  #: number of candidate points
+    descents: int = 300  #: number of descents, from the worst candidates
+    steps: int = 15  #: steps of each descent
+    kept: int = 60  #: number of the best descents that continue together
+    most_pairs: int = 100  #: largest number of rounds of those, each a random step and an exchange
+    quiet_pairs: int = 20  #: rounds within which the least value must fall by `gain`
+    gain: float = 1e-4  #: that decrease
+    first_step: float = 0.3  #: [half-widths] size of the first step
+    last_step: float = 1e-4  #: [half-widths] smallest step
+    moved: float = 0.4  #: probability that a joint moves in a random step
+    leaders: float = 0.2  #: fraction of the best descents towards which others step in an exchange
+    scale: tuple[float, float] = (0.4, 1.0)  #: least and largest factor of these steps
+    exchanged: tuple[float, ...] = (0.2, 0.5, 0.9)  #: probabilities, one drawn for each descent, that a joint exchanges
 
-    velocities: int = 3  #: seed tag of random velocities of the task
+    velocities: int = 3  #: seed tag of the random task velocities
 
 
 WORST = WorstRules()
@@ -53,9 +53,9 @@ Value = Callable[[Array], Array]  #: u (N, n) -> (N,), NaN where there is no val
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """The gradients at N joint positions. Positions where a gradient vanishes or has no value are left out."""
+    """Quality at N joint positions. Positions where a gradient vanishes or is undefined are left out."""
 
-    kept: NDArray[np.bool_]  #: which of the given positions are not left out, (given,)
+    kept: NDArray[np.bool_]  #: whether each given position is not left out, (given,)
     points: Array  #: q, (N, n)
     jacobian: Array  #: J_xi, (N, r, n)
     task_cosines: Array  #: of [AS2023] eq. (24), Euclidean norms, (N, m, r)
@@ -67,7 +67,7 @@ class Judged:
 
     @classmethod
     def at(cls, problem: Problem, coordinates: CoordinateMap, points: Array) -> Self:
-        """Judge coordinates at joint positions (N, n)."""
+        """Evaluate the quality of coordinates at joint positions (given, n), in parts that fit into memory."""
         size = max(1, WORST.chunk // problem.n**2)
         starts = range(0, max(len(points), 1), size)
         parts = [_judged(problem, coordinates, points[start : start + size]) for start in starts]
@@ -79,7 +79,7 @@ class Judged:
 
 
 def _judged(problem: Problem, coordinates: CoordinateMap, points: Array) -> dict[str, Array]:
-    """The fields of `Judged` by name, for so few joint positions that all intermediate values have room in memory."""
+    """The fields of `Judged` by name, at so few joint positions that intermediate values fit into memory."""
     samples = evaluate_samples(problem, points)
     kept = np.ones(len(points), dtype=bool)
     if len(samples) < len(points):
@@ -87,7 +87,7 @@ def _judged(problem: Problem, coordinates: CoordinateMap, points: Array) -> dict
     J = coordinates.jacobian(samples.points)
     with np.errstate(over="ignore", under="ignore", invalid="ignore"):
         squares = np.einsum("sij,sij->si", J, J)
-    # false for NaN, as grown coordinates have it
+    # False for NaN, which grown coordinates may have
     alive = ((squares > 0) & (squares < WORST.longest**2)).all(axis=1)
     kept[kept] = alive
     if not alive.all():
@@ -95,7 +95,7 @@ def _judged(problem: Problem, coordinates: CoordinateMap, points: Array) -> dict
     found = judge(samples, J)
     ends = measure_half_turn_distance(problem, samples.points) < WORST.near_the_end
     if ends.any():
-        # there the rows of the frame Jacobian, which span the same, keep the rank that J_x loses
+        # near half a turn, use the frame Jacobian: its rows span the same space as those of J_x, which loses rank
         rows = problem.task.batched_frame_jacobian(samples.points[ends])[0].reshape(-1, problem.m, problem.n)
         values = in_the_metric(replace(samples[ends], task_jacobian=rows), J[ends])
         for name, part in zip(("leak_sines", "conditioning", "signs"), values, strict=True):
@@ -104,37 +104,37 @@ def _judged(problem: Problem, coordinates: CoordinateMap, points: Array) -> dict
 
 
 def judge(samples: Samples, J: Array) -> dict[str, Array]:
-    """Judge gradients J (N, r, n) at N samples, none of them zero.
+    """Angles and conditioning of nonzero gradients J (N, r, n) at N samples.
 
     Returns:
-        task_cosines, mutual_cosines, metric_mutual_cosines, leak_sines, conditioning and signs, see `Judged`; without
-        metric_mutual_cosines if A is the identity, where they are the others.
+        task_cosines, mutual_cosines, metric_mutual_cosines, leak_sines, conditioning and signs, see `Judged`. If A is
+        the identity, metric_mutual_cosines may be missing; they equal mutual_cosines.
     """
     few = len(J) < MANY or J.shape[2] > MOST_JOINTS
     return judge_by_lapack(samples, J) if few else judge_by_columns(samples, J)
 
 
 def in_the_metric(samples: Samples, J: Array) -> tuple[Array, Array, Array]:
-    """Sines of the leaks (N, r), conditioning (N,) and signs of det J (N,), for gradients J (N, r, n) without zeros."""
+    """Sines of the leaks (N, r), conditioning (N,) and signs of det J (N,), for nonzero gradients J (N, r, n)."""
     found = judge(samples, J)
     return found["leak_sines"], found["conditioning"], found["signs"]
 
 
 def measure_held_speeds(problem: Problem, points: Array, J: Array, seed: int) -> Array:
-    """How much faster than with least norm the joints move to hold xi, where the task moves at random velocities, (N,).
+    """Joint speed needed to hold xi, relative to the least-norm joint speed, for random task velocities u, (N,).
 
-    |J_phi^-1 (u, 0)|_A / |J_x^+ u|_A at each q, with a random unit velocity u (of positions and twists, SI) and the
-    pseudo-inverse J_x^+ in the metric. For r = 1 it is sqrt(1 + (d xi J_x^+ u)^2 / ((d xi z)^2 |J_x^+ u|_A^2)) with the
-    unit self-motion z, and at most 1 / cos(leak).
+    The ratio at each q is |J_phi^-1 [u; 0]|_A / |J_x^+ u|_A, with a random unit velocity u (of positions and twists,
+    SI) and the pseudo-inverse J_x^+ in the metric. For r = 1 with the unit self-motion z, it equals
+    sqrt(1 + (d xi J_x^+ u)^2 / ((d xi z)^2 |J_x^+ u|_A^2)), and is at most 1 / cos(leak).
 
     Args:
         problem: problem of the coordinates.
         points: q, (N, n).
-        J: J_xi there, (N, r, n), without zeros.
+        J: J_xi there, (N, r, n), with nonzero gradients.
         seed: seed of the velocities.
 
     Returns:
-        Factors >= 1; inf where det J_phi = 0.
+        Ratios >= 1, (N,); inf where det J_phi = 0.
 
     Source:
         ours, docs/explanation/angles.md.
@@ -143,13 +143,13 @@ def measure_held_speeds(problem: Problem, points: Array, J: Array, seed: int) ->
     rows = problem.task.batched_frame_jacobian(points)[0].reshape(N, n - r, n)
     whole = np.concatenate([rows, J], axis=1)
     if inverse is not None:
-        # A^-1 = W W^T, and |W^-1 dq| = |dq|_A
+        # change variables so that the metric is Euclidean: A^-1 = W W^T and |dq|_A = |W^-1 dq|
         whole = whole @ np.linalg.cholesky(inverse)
     u = np.random.default_rng((seed, WORST.velocities)).normal(size=(N, n - r))
     velocity = np.concatenate([u / np.linalg.norm(u, axis=1, keepdims=True), np.zeros((N, r))], axis=1)
     regular, speeds = np.linalg.det(whole) != 0, np.full(N, np.inf)
     held = np.linalg.solve(whole[regular], velocity[regular, :, None])
-    # the motion of least norm is its part in the span of the task gradients
+    # the least-norm motion is the projection of the held one onto the span of the task gradients
     span = np.linalg.qr(whole[regular, : n - r].transpose(0, 2, 1))[0]
     least = span.transpose(0, 2, 1) @ held
     speeds[regular] = np.linalg.norm(held, axis=(1, 2)) / np.linalg.norm(least, axis=(1, 2))
@@ -158,7 +158,7 @@ def measure_held_speeds(problem: Problem, points: Array, J: Array, seed: int) ->
 
 @dataclass(frozen=True, eq=False, repr=False)
 class PointQuality(Shown):
-    """Quality of a chart at one joint position, or at each of N. NaN where a gradient vanishes or has no value."""
+    """Quality of a chart at one joint position, or at each of N. NaN where a gradient vanishes or is undefined."""
 
     leak_deg: Array  #: leak of each coordinate [deg], (r,) or (N, r); 0 is perfect
     conditioning: Array  #: smallest singular value of the normalised gradients, () or (N,); 1 perfect, 0 singular
@@ -167,9 +167,9 @@ class PointQuality(Shown):
     )
 
     def facts(self) -> dict[str, str]:
-        """The worst values of the set, or those of the one position."""
+        """The values at the one position, or the worst values of the set."""
         leak, conditioning, distance = np.atleast_2d(self.leak_deg), np.ravel(self.conditioning), self.boundary_distance
-        # the worst of each, where there are values
+        # positions at which the quality is defined
         known = np.isfinite(conditioning)
         single = np.ndim(self.conditioning) == 0
         facts = {"quality": "at one joint position" if single else f"at {len(leak)} joint positions"}
@@ -195,21 +195,21 @@ def point_quality(problem: Problem, coordinates: CoordinateMap, points: Array) -
     conditioning[judged.kept] = judged.conditioning
     lower, upper = problem.domain.bounds
     distance = np.minimum(points - lower, upper - points).min(axis=1)
-    # too near a singularity
+    # positions of the box that violate a condition of the domain lie outside: no positive distance
     distance = np.where(problem.domain.contains(points), distance, np.minimum(distance, 0.0))
     return PointQuality(leak, conditioning, distance)
 
 
 @dataclass(frozen=True, eq=False)
 class WorstPoints:
-    """Points of least conditioning, the worst one first."""
+    """Points with the least conditioning that a search found, the worst one first."""
 
     points: Array  #: q, (k, n)
-    conditioning: Array  #: signed conditioning, (k,), < 0 where the chart folds over
+    conditioning: Array  #: (k,); < 0 where det J has the opposite sign to that at most candidates: the chart folds over
 
     @property
     def least(self) -> float:
-        """Least conditioning found; NaN if it has no value anywhere."""
+        """Least conditioning found; NaN if it is undefined everywhere."""
         return float(self.conditioning[0]) if len(self.conditioning) else float("nan")
 
     @property
@@ -220,15 +220,16 @@ class WorstPoints:
         return f"{found} ({descents} descents from {WORST.candidates} points, many in corners)"
 
     def below(self, bound: float) -> Array:
-        """Points with less conditioning than that, (l, n)."""
+        """The points with a conditioning below a bound, (l, n)."""
         return self.points[self.conditioning < bound]
 
 
 def worst_points(problem: Problem, coordinates: CoordinateMap, seed: int = 0) -> WorstPoints:
-    """Search the domain: uniform candidates, others near faces and corners, then descent from the worst (`descended`).
+    """Search the domain for the points of least conditioning.
 
-    Folds of charts lie in corners and in thin wedges, which uniform samples miss. Points where a gradient vanishes, or
-    a grown coordinate has no value, are left out.
+    Candidates are uniform points and points near faces and corners. Descents (`descended`) start at the worst of them.
+    Folds of charts lie in corners and thin wedges, which uniform samples miss. Points where a gradient vanishes or is
+    undefined are left out.
 
     Args:
         problem: problem of the coordinates.
@@ -246,12 +247,12 @@ def worst_points(problem: Problem, coordinates: CoordinateMap, seed: int = 0) ->
 
 
 def least_in_domain(value: Value, domain: Domain, seed: int = 0) -> Array:
-    """Where a function of the joint position is least, as far as a search of the domain finds it, q (n,).
+    """Search the domain for the joint position q (n,) at which a function is least.
 
-    Candidates as in `worst_points`, then descents.
+    It uses candidates and descents as `worst_points`, and finds a local minimum that need not be the global one.
 
     Args:
-        value: q (N, n) -> (N,); NaN where it has none.
+        value: the function, q (N, n) -> (N,); NaN where it is undefined.
         domain: the domain.
         seed: seed of candidates and steps.
 
@@ -270,18 +271,21 @@ def least_in_domain(value: Value, domain: Domain, seed: int = 0) -> Array:
 
 
 def descended(value: Value, u: Array, found: Array, seed: int) -> tuple[Array, Array]:
-    """Descents from the least of many points of the cube [-1, 1]^n; points and values, the least first.
+    """Minimise a function over the cube [-1, 1]^n by random descents from the best of many points.
 
-    Each is a random search that keeps what is less: a step moves some joints at a time, so that faces and corners are
-    reached, and its size follows success. In 8 joints, gradients by differences cost more. The least descents then go
-    on together, by such steps and by differential evolution in turn: alone, each ends in its own corner, and a box of
-    16 joints has 65,000.
+    Each descent takes random steps and keeps those with a lower value. A step moves only some joints, so that faces and
+    corners are reached; its size grows after success and shrinks after failure. Already with 8 joints, gradients by
+    finite differences would cost more. The best descents then continue together, with such steps and with steps of
+    differential evolution in turn. Alone, each would end in its own corner, and a box of 16 joints has 65,000 corners.
 
     Args:
-        value: the function; NaN where it has none.
-        u: points (N, n).
-        found: its values there, (N,).
-        seed: of the steps.
+        value: the function, u (N, n) -> (N,); NaN where it is undefined.
+        u: start points (N, n).
+        found: values of the function there, (N,).
+        seed: seed of the steps.
+
+    Returns:
+        Points (k, n) and their values (k,), the least first.
 
     Source:
         differential evolution [SP1997], with steps towards one of the best as in [ZS2009].
@@ -291,12 +295,12 @@ def descended(value: Value, u: Array, found: Array, seed: int) -> tuple[Array, A
     u, found, step = u[order], found[order], np.full(len(order), WORST.first_step)
     if not len(u):
         return u, found
-    # short descents of many
+    # short descents from many points
     for _ in range(WORST.steps):
         _step(value, u, found, step, rng)
     order = np.argsort(found)
     u, found, step = u[order], found[order], step[order]
-    # the least of them together, until they gain no more; the places where they began count as well
+    # The best of them continue together, until they gain no more. Their starts stay among the results.
     best, least, own = (part[: WORST.kept].copy() for part in (u, found, step))
     before = [np.inf] * WORST.quiet_pairs
     for _ in range(WORST.most_pairs):
@@ -317,14 +321,14 @@ def descended(value: Value, u: Array, found: Array, seed: int) -> tuple[Array, A
 
 
 def _step(value: Value, u: Array, found: Array, step: Array, rng: np.random.Generator) -> None:
-    """One step of all descents, in place."""
+    """One random step of all descents, in place: u (N, n), values `found` (N,), and step sizes `step` (N,)."""
     moves = rng.normal(size=u.shape) * (rng.uniform(size=u.shape) < WORST.moved)
     less = _take_less(value, u, found, u + step[:, None] * moves)
     step[:] = np.maximum(WORST.last_step, step * np.where(less, 1.5, 0.8))
 
 
 def _take_less(value: Value, u: Array, found: Array, tried: Array) -> NDArray[np.bool_]:
-    """Replace points by those tried, in the cube, whose value is less; which they are."""
+    """Replace points u (N, n) by those tried, clipped to the cube, whose value is less; return which, (N,)."""
     tried = np.clip(tried, -1, 1)
     values = value(tried)
     less: NDArray[np.bool_] = values < found
@@ -333,13 +337,13 @@ def _take_less(value: Value, u: Array, found: Array, tried: Array) -> NDArray[np
 
 
 def _signed_conditioning(problem: Problem, coordinates: CoordinateMap, u: Array) -> Array:
-    """Conditioning times the sign of det J at points of the cube, (N,); NaN outside the domain."""
+    """Conditioning times the sign of det J at points u (N, n) of the cube, (N,); NaN outside the domain."""
     points, values = _joint_positions(problem, u), np.full(len(u), np.nan)
     inside = np.flatnonzero(problem.domain.contains(points))
     try:
         judged = Judged.at(problem, coordinates, points[inside])
-    except SingularTaskError:  # for example at half a turn
-        # points at which the task has no Jacobian are left out
+    except SingularTaskError:
+        # leave out points at which the Jacobian of the task is undefined, for example at half a turn
         J = problem.task.batched_jacobian(points[inside])[0]
         inside = inside[np.isfinite(J.reshape(len(inside), problem.m * problem.n)).all(axis=1)]
         judged = Judged.at(problem, coordinates, points[inside])
@@ -348,25 +352,28 @@ def _signed_conditioning(problem: Problem, coordinates: CoordinateMap, u: Array)
 
 
 def _joint_positions(problem: Problem, u: Array) -> Array:
-    """q of points u of the cube [-1, 1]^n."""
+    """q of points u (N, n) of the cube [-1, 1]^n: centre + half_width u."""
     q: Array = problem.domain.centre + problem.domain.half_width * u
     return q
 
 
-_ROUNDING = 1e-15  # of eigenvalues of matrices whose entries are at most 1
-MOST_JOINTS = 10  #: of more the formulas take longer to build than they save
-_SMALLEST_PIVOT = 1e-14  # keeps singular samples finite
-_STEPS = 5  # towards the smallest eigenvalue; few samples need more
-_MOST_ROUNDS = 20  # of so many steps; a smallest eigenvalue that occurs twice takes 25 steps
+_ROUNDING = 1e-15  # rounding error of eigenvalues of matrices whose entries are at most 1
+MOST_JOINTS = 10  #: number of joints above which the formulas take longer to build than they save
+_SMALLEST_PIVOT = 1e-14  # lower bound of pivots, which keeps singular samples finite
+_STEPS = 5  # steps towards the smallest eigenvalue in a round; few samples need more than one round
+_MOST_ROUNDS = 20  # largest number of rounds; a double smallest eigenvalue takes 25 steps, or 5 rounds
 
 
 def pairs(r: int) -> list[tuple[int, int]]:
-    """The pairs (i, j), i > j, of r coordinates in the order of the mutual cosines."""
+    """The pairs (i, j), i > j, of r coordinates, in the order of the mutual cosines."""
     return [(i, j) for j, i in combinations(range(r), 2)]
 
 
 def whitened(gram: ca.SX, columns: ca.SX, least: float) -> ca.SX:
-    """L^-1 c for columns c (m, r), where L L^T is the Gram matrix (m, m) with pivots of at least `least`."""
+    """L^-1 c for columns c (m, r), with the Cholesky factor L of a Gram matrix (m, m).
+
+    Squared diagonal entries of L below `least` are replaced by it.
+    """
     m = gram.size1()
     L, found = ca.SX.zeros(m, m), ca.SX(columns)
     for j in range(m):
@@ -378,15 +385,15 @@ def whitened(gram: ca.SX, columns: ca.SX, least: float) -> ca.SX:
 
 
 def triangle(matrix: ca.SX) -> list[ca.SX]:
-    """Numbers whose product is the determinant of a square matrix, by reflections of its rows.
+    """The diagonal of a triangular form of a square matrix, by Householder reflections; its product is the determinant.
 
-    The first k are, up to their signs, the diagonal of the Cholesky factor of the Gram matrix of the first k rows.
+    The first k numbers are, up to sign, the diagonal of the Cholesky factor of the Gram matrix of the first k rows.
     """
     A, n = ca.SX(matrix), matrix.size1()
     found = []
     for k in range(n - 1):
         v, norm, half = _reflection(A[k, k:].T)
-        # the pivot is of the other sign, and so is the reflection
+        # The entry becomes -norm with the sign of A[k, k], and a reflection has determinant -1: both signs cancel.
         found.append(ca.if_else(A[k, k] >= 0, norm, -norm))
         shares = A[k + 1 :, k:] @ v / _or_one(half)
         A[k + 1 :, k + 1 :] -= shares @ v[1:].T
@@ -394,11 +401,11 @@ def triangle(matrix: ca.SX) -> list[ca.SX]:
 
 
 def tridiagonal(matrix: ca.SX) -> tuple[ca.SX, ca.SX]:
-    """Diagonal (n, 1) and squares of the entries beside it (n - 1, 1) of a similar tridiagonal matrix."""
+    """Tridiagonal form of a symmetric matrix (n, n): diagonal (n, 1), and squares of the off-diagonal (n - 1, 1)."""
     A, n = ca.SX(matrix), matrix.size1()
     squares = []
     for k in range(n - 2):
-        # Householder's reflection of column k, from both sides
+        # apply the Householder reflection of column k from both sides
         v, norm, half = _reflection(A[k + 1 :, k])
         squares.append(norm * norm)
         w = A[k + 1 :, k + 1 :] @ v / _or_one(half)
@@ -411,23 +418,26 @@ def tridiagonal(matrix: ca.SX) -> tuple[ca.SX, ca.SX]:
 
 
 def _reflection(column: ca.SX) -> tuple[ca.SX, ca.SX, ca.SX]:
-    """Direction v that reflects the column to the first axis, the column's norm, and half the squared norm of v."""
+    """Householder vector v that reflects a column onto the first axis; the column's norm; and |v|^2 / 2."""
     norm = ca.norm_2(column)
     half = norm * (norm + ca.fabs(column[0]))
     return ca.vertcat(column[0] + ca.if_else(column[0] >= 0, norm, -norm), column[1:]), norm, half
 
 
 def _or_one(x: ca.SX) -> ca.SX:
-    """The number x > 0, or 1."""
+    """x if x > 0, else 1, as a divisor."""
     return ca.if_else(x > 0, x, 1.0)
 
 
 def laguerre(diagonal: ca.SX, squares: ca.SX, at: ca.SX, steps: int) -> tuple[ca.SX, ca.SX]:
-    """Steps towards the smallest eigenvalue of a tridiagonal matrix, from below: where they end, and the last step.
+    """Laguerre steps from `at` up to the smallest eigenvalue of a tridiagonal matrix T, where `at` is a lower bound.
 
-    Steps from below never pass the eigenvalue, but by rounding. No step follows then. The characteristic polynomial is
-    the product of the pivots q_i of T - at I, so the sums of 1 / (lambda_i - at) and of its square, which Laguerre's
-    step needs, follow from q_i and two derivatives.
+    The characteristic polynomial is the product of the pivots q_i of T - at I. Laguerre's step needs the sums of
+    1 / (lambda_i - at) and of its square; they follow from the q_i and their first two derivatives. In exact arithmetic
+    steps from below never pass the eigenvalue. If rounding makes a pivot negative, the step is 0.
+
+    Returns:
+        The place after `steps` steps, and the length of the last step.
     """
     n, step = diagonal.size1(), ca.SX(0)
     for _ in range(steps):
@@ -443,21 +453,24 @@ def laguerre(diagonal: ca.SX, squares: ca.SX, at: ca.SX, steps: int) -> tuple[ca
             first -= share
             second += share * share - bend * inverse
         ahead = n / (first + ca.sqrt(ca.fmax((n - 1) * (n * second - first * first), 0.0)))
-        # the eigenvalue is ahead while all pivots are positive
+        # all pivots are positive exactly if the smallest eigenvalue is still ahead
         step = ca.if_else(least > 0, ahead, 0.0)
         at = at + step
     return at, step
 
 
 def judge_by_columns(samples: Samples, J: Array) -> dict[str, Array]:
-    """Like `judge`, for enough samples to fill columns. Without metric_mutual_cosines if A is the identity."""
+    """As `judge`, by scalar formulas on blocks of samples as columns, for many samples.
+
+    metric_mutual_cosines are missing if A is the identity.
+    """
     (N, r, n), inverse = J.shape, samples.metric_inverse
     data = [samples.task_jacobian.reshape(N, -1), J.reshape(N, -1), np.zeros((N, 1))]
     if inverse is not None:
         data.append(inverse.reshape(N, -1))
     function, sizes = _function(n - r, n, inverse is None)
     rows = _evaluated(function, sum(sizes.values()), data)
-    # samples whose last step was more than rounding go on with the search for the smallest eigenvalue
+    # samples whose last Laguerre step was more than rounding continue from the place reached
     left = np.flatnonzero(rows[:, -1] > _ROUNDING)
     for _ in range(_MOST_ROUNDS):
         if not left.size:
@@ -474,7 +487,7 @@ def judge_by_columns(samples: Samples, J: Array) -> dict[str, Array]:
 
 
 def _evaluated(function: ColumnFunction, size: int, data: list[Array]) -> Array:
-    """Results (N, size) for data (N, ...)."""
+    """Evaluate a function at N samples; `data` are its inputs, (N, ...) each. Returns (N, size)."""
 
     def build_block_function() -> BlockFunction:
         run = function.build_block_function()
@@ -487,7 +500,11 @@ def _evaluated(function: ColumnFunction, size: int, data: list[Array]) -> Array:
 
 @cache
 def _function(m: int, n: int, euclidean: bool) -> tuple[ColumnFunction, dict[str, int]]:
-    """The function of J_x, J_xi, a bound below the eigenvalues, and A^-1, row by row; names and sizes of results."""
+    """The formulas as a function of J_x and J_xi row by row, a lower bound of the eigenvalues, and A^-1.
+
+    Returns:
+        The function, which stacks its results in a column, and their sizes by name.
+    """
     J, at, inverse = ca.SX.sym("J", n, n), ca.SX.sym("at"), ca.SX.sym("inverse", n, n)
     found = _formulas(J[:, :m].T, J[:, m:].T, None if euclidean else inverse, at)
     inputs = [ca.SX.sym("task", n * m), ca.SX.sym("covectors", n * (n - m)), at]
@@ -498,12 +515,16 @@ def _function(m: int, n: int, euclidean: bool) -> tuple[ColumnFunction, dict[str
 
 
 def _formulas(task: ca.SX, covectors: ca.SX, inverse: ca.SX | None, at: ca.SX) -> dict[str, ca.SX]:
-    """Columns by name for rows of J_x (m, n) and J_xi (r, n)."""
+    """Expressions of the results of `judge` by name, from rows of J_x (m, n) and J_xi (r, n), and A^-1 (None: I).
+
+    In place of the conditioning, they have the smallest eigenvalue of the Gram matrix, its square, and the last
+    Laguerre step towards it from `at`.
+    """
     m, r = task.size1(), covectors.size1()
     raised, gradients = (rows if inverse is None else rows @ inverse for rows in (task, covectors))
     products, shares = gradients @ covectors.T, raised @ covectors.T
     euclidean, own = _lengths(covectors), ca.sqrt(ca.diag(products))
-    # normalise rows first, so that units do not matter
+    # normalise the rows first, so that units do not matter
     scale = ca.sqrt(ca.sum2(raised * task))
     along = whitened(raised @ task.T / (scale @ scale.T), shares / (scale @ own.T), _SMALLEST_PIVOT)
     unit = products / (own @ own.T)
@@ -513,7 +534,7 @@ def _formulas(task: ca.SX, covectors: ca.SX, inverse: ca.SX | None, at: ca.SX) -
         return ca.vertcat(ca.SX(0, 1), *(matrix[i, j] for i, j in pairs(r)))
 
     eigenvalue, last_step = laguerre(*tridiagonal(gram), at, _STEPS)
-    # of the determinant; 0 if a pivot is exactly 0
+    # sign of the determinant; 0 if a pivot is exactly 0
     sign = ca.SX(1)
     for pivot in triangle(ca.vertcat(task, covectors)):
         sign *= ca.sign(pivot)
@@ -529,12 +550,12 @@ def _formulas(task: ca.SX, covectors: ca.SX, inverse: ca.SX | None, at: ca.SX) -
 
 
 def _lengths(rows: ca.SX) -> ca.SX:
-    """Euclidean norms of rows, a column."""
+    """Euclidean norms of the rows of a matrix, as a column."""
     return ca.sqrt(ca.sum2(rows * rows))
 
 
 def judge_by_lapack(samples: Samples, J: Array) -> dict[str, Array]:
-    """Like `judge`."""
+    """As `judge`, by LAPACK, for few samples or many joints."""
     gradients, covectors, unit = samples.compute_metric_gradients(J), J.transpose(0, 2, 1), _unit(J)
     own = np.sqrt(np.einsum("sij,sij->si", gradients, J))
     first, second = (np.array([pair[k] for pair in pairs(J.shape[1])], dtype=int) for k in (0, 1))
@@ -554,6 +575,6 @@ def judge_by_lapack(samples: Samples, J: Array) -> dict[str, Array]:
 
 
 def _unit(rows: Array) -> Array:
-    """Rows (N, k, n) of Euclidean length 1."""
+    """Rows (N, k, n) scaled to Euclidean length 1."""
     unit: Array = rows / np.linalg.norm(rows, axis=2, keepdims=True)
     return unit
