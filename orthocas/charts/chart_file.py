@@ -1,4 +1,4 @@
-"""Chart files: a chart, its problem and its certificate as a header and arrays, and back."""
+"""Chart files: write a chart, its problem and its certificate as a header and arrays, and read them back."""
 
 import hashlib
 import json
@@ -28,13 +28,13 @@ from orthocas.tools.json import get_part
 
 _TREES = ("regular", "injective")
 _CORNERS = ("low", "high", "codes")
-_GUARDED = ("least_volume", "clear_share")  # in certificates of domains that keep folds out
-FREE = "free postures only"  #: note of charts that were fitted without postures in collision: where pairs are from
+_GUARDED = ("least_volume", "clear_share")  # fields of certificates whose domain is a RegularPart
+FREE = "free postures only"  #: note of charts fitted without postures in collision; says where the pairs come from
 CHART = Kind("chart", 1, ChartFileError)
-KINDS = (RegularPart,)  #: of domains that files may have beside those of `orthocas.tasks`; the import registers them
-_PROBES = 8  # points of the domain where a chart that is read is evaluated
-_MODERATE = 1e50  # products of a few such numbers do not overflow
-_BOUNDED = (Polynomial, Fourier, Linear, MLP)  # finite wherever their parameters are
+KINDS = (RegularPart,)  #: kinds of domains in files besides those of `orthocas.tasks`; importing registers them
+_PROBES = 8  # points of the domain at which a chart is evaluated after reading
+_MODERATE = 1e50  # products of a few numbers below this do not overflow
+_BOUNDED = (Polynomial, Fourier, Linear, MLP)  # parametrisations that are finite if their parameters are
 _LEAF = "leaf_"  # prefix of the names of arrays that belong to a base leaf
 
 
@@ -58,15 +58,15 @@ def certificate_from_data(data: Mapping[str, Any], arrays: Mapping[str, Stored],
     """The certificate of a chart of n joints.
 
     Raises:
-        InvalidValueError: if something is missing or makes no sense. The message names it.
+        InvalidValueError: if a field is missing or invalid. The message names it.
     """
-    # the two trees of boxes, and a fold if there is one
+    # the subdivisions of both proofs, and a fold if there is one
     regular = _tree(arrays, "regular", n)
     injective = _tree(arrays, "injective", n) if "certificate_injective_codes" in arrays else None
     fold = get_part(data, "fold", list)
     if len(fold) not in (0, 2) or any(not isinstance(point, list) or len(point) != n for point in fold):
         raise InvalidValueError("fold of a certificate", repr(fold)[:80], f"no or two joint positions of {n} numbers")
-    # numbers that came later are missing in older files
+    # Older files lack some numbers; they get the defaults.
     known = Certificate(
         get_part(data, "fingerprint", str),
         get_part(data, "method", str),
@@ -82,24 +82,26 @@ def certificate_from_data(data: Mapping[str, Any], arrays: Mapping[str, Stored],
         _number(data, "clear_share") if "clear_share" in data else 0.0,
         get_part(data, "digest", str) if "digest" in data else "",
     )
-    # older files count boxes that were given up
+    # Older files also count boxes that were given up.
     if "dead" not in data:
         return known
     return known.remove_given_up(require_count("dead boxes of a certificate", int(_number(data, "dead")), least=0))
 
 
 def _tree(arrays: Mapping[str, Stored], name: str, n: int) -> Subdivision:
+    """The subdivision of one proof of a certificate, for n joints."""
     low, high, codes = (get_part(arrays, f"certificate_{name}_{corner}", np.ndarray) for corner in _CORNERS)
     tree = Subdivision(low, high, codes)
     if tree.n != n:
-        raise InvalidValueError(f"box of '{name}' in a certificate", f"one of {tree.n} joints", f"{n} joints")
+        raise InvalidValueError(f"box of '{name}' in a certificate", f"a box of {tree.n} joints", f"{n} joints")
     return tree
 
 
 def _number(data: Mapping[str, Any], name: str) -> float:
+    """A finite field >= 0 of a certificate; raises InvalidValueError for anything else."""
     value = data.get(name)
     if isinstance(value, bool) or not isinstance(value, int | float) or not 0 <= value < 1e300:
-        raise InvalidValueError(f"field '{name}' of a certificate", repr(value)[:80], "a number that is not negative")
+        raise InvalidValueError(f"field '{name}' of a certificate", repr(value)[:80], "a finite number >= 0")
     return float(value)
 
 
@@ -115,20 +117,21 @@ def write_chart(
     force: bool = False,
     collisions: Collisions | None = None,
 ) -> None:
-    """Write a chart, with a collision model, or the one that the file had from which its robot came.
+    """Write a chart file with a collision model, if there is one.
 
-    `orthocas.tools.archive` describes the container.
+    Default of `collisions`: the model of the chart file from which the robot was loaded, or the robot's own model for
+    charts that were fitted without postures in collision. `orthocas.tools.archive` describes the container.
 
     Raises:
         ChartFileError: if the file cannot be written, or would replace something other than a chart without `force`.
     """
     header, arrays = _content(problem, coordinates)
     header["notes"] = _checked_notes(notes)
-    # the proof holds for these notes only
+    # The certificate is stored with a digest of the notes, so that edited notes are noticed.
     if certificate is not None:
         data, proof = certificate_to_data(certificate)
         header["certificate"], arrays = {**data, "notes": _digest_of(header["notes"])}, {**arrays, **proof}
-    # solids that came from a chart file go into the next one
+    # solids that were read from a chart file, or that shaped the fit, go into the new file
     if collisions is None and (isinstance(problem.robot.solids, KnownSolids) or FREE in notes):
         collisions = problem.robot.collisions
     if collisions is not None:
@@ -138,7 +141,7 @@ def write_chart(
 
 
 def fingerprint(problem: Problem, coordinates: CoordinateMap) -> str:
-    """A digest of all that defines the chart: robot, task, metric, domain and coordinates, but no notes."""
+    """SHA-256 of all that defines the chart: robot, task, metric, domain and coordinates, without notes."""
     header, arrays = _content(problem, coordinates)
     digest = hashlib.sha256(json.dumps(header, sort_keys=True).encode())
     for name in sorted(arrays):
@@ -161,7 +164,7 @@ def _content(problem: Problem, coordinates: CoordinateMap) -> tuple[dict[str, An
 
 
 def read_chart(path: str | Path) -> tuple[Problem, CoordinateMap, Notes, Certificate | None]:
-    """Read a chart back.
+    """Read a chart file: problem, coordinates, notes, and certificate if there is one.
 
     Raises:
         ChartFileError: if the file is missing, truncated, edited, not a chart file, or from a newer version.
@@ -185,20 +188,20 @@ def read_chart(path: str | Path) -> tuple[Problem, CoordinateMap, Notes, Certifi
             )
             if isinstance(parametrisation, CyclicParametrisation):
                 require_cyclic(problem, parametrisation.cyclic)
-        # what a file states must fit together
+        # the parts of the file must be consistent
         if coordinates.r != problem.r:
             raise ChartFileError(f"{path} has {coordinates.r} coordinates, expected r = {problem.r}")
         _require_finite(problem, coordinates)
         if "collisions" in header:
             solids = collisions_from_data(problem.robot.tree, get_part(header, "collisions", dict), arrays)
             problem.robot.solids = KnownSolids(solids)
-        # a proof of other coordinates is refused
+        # a certificate of another chart is refused
         certificate = None
         if "certificate" in header:
             proof = get_part(header, "certificate", dict)
             certificate = certificate_from_data(proof, arrays, problem.n)
             certificate.require_for(fingerprint(problem, coordinates))
-            # notes are missing in older files
+            # certificates in older files have no digest of the notes
             if "notes" in proof and proof["notes"] != _digest_of(header["notes"]):
                 raise CertifyError("the notes have been changed since the file was written")
         return problem, coordinates, _checked_notes(get_part(header, "notes", dict)), certificate
@@ -211,15 +214,15 @@ def read_chart(path: str | Path) -> tuple[Problem, CoordinateMap, Notes, Certifi
 
 
 def _digest_of(notes: Mapping[str, Any]) -> str:
-    """SHA-256 of notes: they are no part of a proof, and a certified chart shows them beside it."""
+    """SHA-256 of notes. A proof does not cover notes, but a certified chart shows them, so changes must be noticed."""
     return hashlib.sha256(json.dumps(notes, sort_keys=True).encode()).hexdigest()
 
 
 def _checked_notes(notes: Notes) -> dict[str, str | float]:
-    """Notes of texts and finite numbers.
+    """A copy of notes whose values are texts or finite numbers.
 
     Raises:
-        InvalidValueError: for anything else.
+        InvalidValueError: if a note has another value.
     """
     for name, value in notes.items():
         require_text("name of a note", name)
@@ -231,14 +234,17 @@ def _checked_notes(notes: Notes) -> dict[str, str | float]:
 
 
 def _require_finite(problem: Problem, coordinates: CoordinateMap) -> None:
-    """Look once at what will be evaluated. Singular points, also at the centre, are no reason to refuse a chart.
+    """Check that a chart is finite at some point of its domain, after reading.
+
+    Singular points, even at the centre, are no reason to refuse a chart.
 
     Raises:
-        InvalidValueError: if task, coordinates or their Jacobians are finite at none of a few points of the domain.
+        InvalidValueError: if the task, the coordinates or one of their Jacobians is finite at none of a few points.
     """
     q = sample_uniform(problem.domain, _PROBES, 0)
     values = {"the task": problem.task.batched(q)[0], "the Jacobian of the task": problem.task.batched_jacobian(q)[0]}
-    # grown ones may be NaN; others are finite on their domain where all their numbers are moderate: a quick check
+    # Grown coordinates may be NaN anywhere, so they are not checked. Fitted ones are finite if all their numbers are
+    # moderate and their family is bounded; otherwise they are evaluated.
     if isinstance(coordinates, Coordinates):
         sizes = [np.abs(numbers) for numbers in (coordinates.theta, coordinates.offset, coordinates.scale)]
         widths = coordinates.space.half_width
@@ -251,7 +257,7 @@ def _require_finite(problem: Problem, coordinates: CoordinateMap) -> None:
 
 
 def _idle(joints: list[int], n: int) -> tuple[int, ...]:
-    """The idle joints, checked against the number of joints."""
+    """Check that idle joints are different indices of n joints; return them."""
     idle = tuple(require_count("idle joint", k, least=0) for k in joints)
     if len(set(idle)) != len(idle) or any(k >= n for k in idle):
         raise InvalidValueError("idle joints", str(idle)[:80], f"different indices below {n}")

@@ -31,17 +31,17 @@ if TYPE_CHECKING:
 class ReportRules:
     """Numbers of an evaluation."""
 
-    bin: float = 0.1  #: [deg]; the middle angle lies in the middle of its bin
-    piece: int = 2**13  #: samples that a thread takes at once
+    bin: float = 0.1  #: [deg] width of the bins of histograms; 0 and 90 degrees lie in the middle of a bin
+    piece: int = 2**13  #: samples that a thread evaluates at once
     degenerate: float = 0.1  #: 1 % quantile of the conditioning below which a chart is reported as degenerate
-    samples: int = 100_000  #: by default
-    seed: int = 1  #: by default
-    most: int = 10**18  #: samples of one call, which floats count
-    telling: int = 200  #: samples by which idle joints are found
-    alone: float = 1e-10  #: fraction of a gradient that counts as zero
-    held: int = 20_000  #: most samples at which joints move with xi held
-    mostly: float = 0.9  #: quantile of their speeds there that is reported
-    postures: int = 10_000  #: most samples that are checked for collisions
+    samples: int = 100_000  #: default number of samples
+    seed: int = 1  #: default seed
+    most: int = 10**18  #: largest number of samples in a call
+    telling: int = 200  #: number of samples from which idle joints are identified
+    alone: float = 1e-10  #: entries of a gradient up to this fraction of its length count as zero
+    held: int = 20_000  #: largest number of samples at which joint speeds with xi held are measured
+    mostly: float = 0.9  #: quantile of these speeds that is reported
+    postures: int = 10_000  #: largest number of samples that are checked for collisions
 
 
 RULES = ReportRules()
@@ -57,25 +57,29 @@ def evaluate(
 ) -> Report:
     """Measure the quality of a chart on uniform samples of its domain. Use another seed than that of the fit.
 
-    Uniform samples miss folds, so the least conditioning is searched near faces and corners too, and by descent.
+    Uniform samples miss folds, so the least conditioning is also searched near faces and corners, and by descent.
 
     The task and mutual angles are those of [AS2023] eq. (24): between each dxi_j and grad_A h_i, over all m r pairs,
-    and between the coordinates, over all r (r - 1) / 2 pairs. Their norms are Euclidean, so for A = M they hide how far
-    a coordinate leans into the task. The leak, the angle in the metric, shows it; see `LeakStatistics`. The
-    conditioning is computed in coordinates where A is the identity, so it does not depend on the task's own
-    conditioning or units.
+    and between the coordinates, over all r (r - 1) / 2 pairs. Their norms are Euclidean, so for A = M they do not show
+    how far a coordinate is from orthogonal to the task. The leak, an angle in the metric, shows it; see
+    `LeakStatistics`. The conditioning is computed in coordinates where A is the identity, so it does not depend on the
+    conditioning or the units of the task itself.
 
     Args:
         chart: the chart.
         samples: number of samples N. Default: 100,000.
         seed: seed of the samples. Default: 1.
         points: joint positions (N, n) or (n,) [rad] or [m] in place of samples, for example those of a path.
-        collisions: of the chart's robot, such as `robot.collisions`: the report says how many of up to 10,000 samples
-            touch. Charts of `fit_wide(collisions=True)` are evaluated so by default, and at free samples only.
+        collisions: a collision model of the chart's robot, such as `robot.collisions`. The report then says how many of
+            up to 10,000 samples are in collision. For charts of `fit_wide(collisions=True)`, the robot's own model is
+            the default, and samples in collision are left out.
+
+    Returns:
+        The report.
 
     Raises:
-        SingularTaskError: if a gradient vanishes, or a coordinate has no value, everywhere.
-        InvalidValueError, ShapeError: if an argument is invalid, or both points and samples or a seed are given.
+        SingularTaskError: if at every sample a gradient vanishes, or a coordinate is undefined.
+        InvalidValueError, ShapeError: if an argument is invalid, or points are given with samples or a seed.
 
     Example:
         >>> import orthocas as oc
@@ -92,7 +96,7 @@ def evaluate(
     free = FREE in chart.notes
     if free and collisions is None:
         collisions = chart.problem.robot.collisions
-    # samples of one's own, and a search for the worst points, which samples miss
+    # uniform samples, and a search for the worst points, which samples miss
     if points is None:
         count = _count(chart, RULES.samples if samples is None else samples)
         drawn = require_count("seed", RULES.seed if seed is None else seed, least=0)
@@ -100,7 +104,7 @@ def evaluate(
         problem, found = chart.problem, chart.coordinates
         worst = worst_points(problem, found, drawn) if searched else None
         return _report(chart, sample_uniform(chart.problem.domain, count, drawn), drawn, worst, collisions, free)
-    # or the points that were given, and nothing else
+    # the given points alone
     if samples is not None or seed is not None:
         raise InvalidValueError("points", "given with samples or a seed", "points alone")
     given = as_point_set("points", points, chart.n)[0]
@@ -109,7 +113,7 @@ def evaluate(
 
 
 def _count(chart: Chart, samples: int) -> int:
-    """The number of samples, if there is memory for them."""
+    """Check the number of samples, and that memory suffices for them; return it."""
     count = require_count("samples", samples, most=RULES.most)
     require_memory(f"evaluating {count} samples", 8.0 * count * chart.n * (2 * chart.n + 4))
     return count
@@ -123,17 +127,18 @@ def _report(
     collisions: Collisions | None,
     free: bool = False,
 ) -> Report:
+    """The report at joint positions (N, n); with `free`, positions in collision are left out."""
     contacts = None if collisions is None else ContactShare.of(collisions, points[: RULES.postures])
     if collisions is not None and free:
         points = points[collisions.check_free(points)]
         if not len(points):
-            raise InvalidValueError("collisions", "a contact at all samples of the domain", "free postures")
-    # what is singular, or without a value, is left out and counted
+            raise InvalidValueError("collisions", "a contact at all samples of the domain", "some free samples")
+    # singular positions, and those with undefined values, are left out and counted
     judged = Judged.at(chart.problem, chart.coordinates, points)
     if len(judged.points) == 0:
         where = "given points" if seed is None else "samples of the domain"
         raise SingularTaskError(f"a gradient vanishes, or a coordinate has no value, at all {len(points)} {where}")
-    # coordinates that are functions of one idle joint alone, with the names of these joints
+    # find coordinates that depend on one idle joint alone: on a few samples first, then on all of them
     first = evaluate_samples(chart.problem, sample_uniform(chart.problem.domain, RULES.telling, 0))
     idle: dict[int, str] = {}
     for joint in find_idle_joints(chart.problem, first):
@@ -142,10 +147,10 @@ def _report(
         idle |= {int(j): chart.problem.robot.joint_names[joint] for j in sure}
     others = [j for j in range(chart.r) if j not in idle]
     floating = {chart.problem.robot.joint_names[k] for k in chart.problem.robot.tree.floating}
-    # all coordinates, and those that are no joints, whose exact ones would flatter the means
+    # angles of all coordinates, and without idle joints, which are exact and would make the means look better
     angles, without_idle = Angles.of(judged, [range(chart.r), others])
     short, long = np.quantile(_lengths(judged.jacobian), [0.01, 0.99], axis=0)
-    # how fast joints move with xi held, at some of the points
+    # joint speeds with xi held, at some of the points
     some = slice(RULES.held)
     speeds = measure_held_speeds(chart.problem, judged.points[some], judged.jacobian[some], seed or 0)
     # the point of least conditioning, (n,)
@@ -178,7 +183,7 @@ def _report(
 
 
 def _functions_of(joint: int, J: Array) -> NDArray[np.int_]:
-    """Coordinates whose gradients, rows of J (N, r, n), have entries for one joint only."""
+    """Coordinates that depend on one joint alone: their gradients, rows of J (N, r, n), vanish for all other joints."""
     others = np.abs(np.delete(J, joint, axis=2)).max(axis=2, initial=0.0) <= RULES.alone * _lengths(J)
     return np.flatnonzero(others.all(axis=0))
 
@@ -190,10 +195,10 @@ def _lengths(J: Array) -> Array:
 
 @dataclass(frozen=True, eq=False)
 class _Sums:
-    """Sums over the samples of some angles in degrees, each angle a column."""
+    """Sums over samples of k angles [deg], each a column, from which statistics are computed."""
 
-    count: int  #: of samples
-    middle: float  #: 90 or 0
+    count: int  #: number of samples
+    middle: float  #: angle from which deviations are measured [deg]: 90 or 0
     first: Array  #: sum of deviations from the middle, (k,)
     second: Array  #: sum of their squares, (k,)
     largest: Array  #: largest absolute deviation, (k,)
@@ -201,12 +206,15 @@ class _Sums:
 
     @classmethod
     def of(cls, inverse: Callable[[Array], Array], values: Array, middle: float, most: int) -> Self:
-        """Sums of inverse(values), for values (N, k); angles are at most `most` degrees."""
+        """Sums of the angles inverse(values), for cosines or sines `values` (N, k) and arccos or arcsin as `inverse`.
+
+        `most` is the largest possible angle [deg].
+        """
         N, k = values.shape
         bins = round(most / RULES.bin) + 1
         first_bins = bins * np.arange(k)[:, None]
 
-        # pieces of the samples in threads; their sums are added in order
+        # Threads compute sums over pieces of the samples. They are added in order, so the result is reproducible.
         def one_piece(start: int) -> tuple[Array, Array, Array, Indices]:
             angles = np.degrees(inverse(np.ascontiguousarray(values[start : start + RULES.piece].T)))
             places = (angles / RULES.bin + 0.5).astype(np.intp) + first_bins
@@ -221,7 +229,7 @@ class _Sums:
         return cls(N, middle, first, second, largest, counts)
 
     def __getitem__(self, columns: Sequence[int]) -> _Sums:
-        """Sums of some of the angles."""
+        """The sums of the selected angles."""
         chosen = list(columns)
         parts = (self.first[chosen], self.second[chosen], self.largest[chosen], self.counts[chosen])
         return _Sums(self.count, self.middle, *parts)
@@ -233,17 +241,17 @@ class _Sums:
 
     @property
     def mean(self) -> float:
-        """Mean deviation."""
+        """Mean deviation from `middle` over all angles and samples [deg]."""
         return float(self.first.sum() / (self.count * len(self.first)))
 
     @property
     def mean_square(self) -> float:
-        """Mean squared deviation."""
+        """Mean squared deviation from `middle` over all angles and samples [deg^2]."""
         return float(self.second.sum() / (self.count * len(self.first)))
 
 
 def _sums_of_cosines(cosines: Array) -> _Sums:
-    """Sums of arccos(cosines), for cosines (N, k)."""
+    """Sums of the angles arccos(cosines) [deg], for cosines (N, k)."""
     return _Sums.of(np.arccos, np.clip(cosines, -1.0, 1.0), 90.0, 180)
 
 
@@ -258,12 +266,12 @@ class AngleStatistics:
 
     @classmethod
     def of_cosines(cls, cosines: Array) -> Self:
-        """Statistics of the angles arccos(cosines), in degrees."""
+        """Statistics of the angles arccos(cosines), for cosines of any shape."""
         return cls.of_sums(_sums_of_cosines(cosines.reshape(-1, 1)))
 
     @classmethod
     def of_sums(cls, sums: _Sums) -> Self:
-        """Statistics of all angles of some sums."""
+        """Statistics over all angles and samples of the sums."""
         counts = sums.counts.sum(axis=0)
         if sums.empty:
             return cls(np.nan, np.nan, np.nan, counts)
@@ -295,7 +303,7 @@ class LeakStatistics:
 
     @classmethod
     def of_sums(cls, sums: _Sums) -> Self:
-        """Statistics of the leaks of some coordinates, each a column of the sums."""
+        """Statistics of leaks from their sums; each column is a coordinate."""
         counts = sums.counts.sum(axis=0)
         if sums.empty:
             return cls(np.nan, np.nan, np.nan, (), counts)
@@ -309,7 +317,7 @@ class LeakStatistics:
 
 @dataclass(frozen=True, eq=False)
 class Angles:
-    """Angles of some coordinates: those of [AS2023] eq. (24), with Euclidean norms, and ours, in the metric."""
+    """Angles of a set of coordinates: those of [AS2023] eq. (24), with Euclidean norms, and ours, in the metric."""
 
     task_angle: AngleStatistics  #: between each dxi_j and grad_A h_i, in the paper's cosines
     mutual_angle: AngleStatistics  #: between two coordinates, in the paper's cosines
@@ -318,7 +326,7 @@ class Angles:
 
     @classmethod
     def of(cls, judged: Judged, chosen: Sequence[Sequence[int]]) -> list[Angles]:
-        """The angles of each of some sets of coordinates of `judged`."""
+        """The angles of several sets of coordinates; each set is a sequence of their indices."""
         N, m, r = judged.task_cosines.shape
         task = _sums_of_cosines(judged.task_cosines.reshape(N, m * r))
         mutual = _sums_of_cosines(judged.mutual_cosines)
@@ -348,7 +356,7 @@ class Angles:
 class Conditioning:
     """Smallest singular value of [A-orthonormal task basis; unit coordinate gradients]: 1 is perfect, 0 degenerate."""
 
-    min: float  #: of samples and of the search for the worst points; 0 if the search finds folds
+    min: float  #: least value, of the samples and of the search for the worst points; 0 if the search finds folds
     p01: float  #: 1 % quantile
     mean: float
 
@@ -361,16 +369,16 @@ class Conditioning:
 
 @dataclass(frozen=True, eq=False)
 class ContactShare:
-    """How many postures touch, of some of the samples of an evaluation."""
+    """Number of samples in collision, among those that an evaluation checks."""
 
-    samples: int
-    touching: int
-    pair: tuple[str, str]  #: that touches most often, or the nearest one if none touches
+    samples: int  #: number of samples checked
+    touching: int  #: number of these in collision
+    pair: tuple[str, str]  #: the pair that touches most often, or the nearest pair if none touches
     deepest: float  #: least distance [m], negative if a pair overlaps
 
     @classmethod
     def of(cls, collisions: Collisions, points: Array) -> ContactShare:
-        """Count contacts of postures (N, n)."""
+        """Count the postures (N, n) in collision."""
         found = collisions.distance(points)
         touching = np.flatnonzero(found.distance <= 0)
         pairs = Counter(found.pair[k] for k in touching)
@@ -380,7 +388,7 @@ class ContactShare:
 
     @property
     def fraction(self) -> float:
-        """Fraction of the postures that touch."""
+        """Fraction of the samples in collision."""
         return self.touching / self.samples
 
     def __str__(self) -> str:
@@ -390,7 +398,7 @@ class ContactShare:
         return f"{percent(self.fraction, 2, fault=True)} of the samples, most often '{first}' and '{second}'"
 
     def as_dict(self) -> dict[str, object]:
-        """Plain data."""
+        """Plain data for JSON."""
         return collect_attributes(self, "samples", "touching", "fraction", "pair", "deepest")
 
 
@@ -406,18 +414,18 @@ class Report(Shown):
     metric: str
     task_angle: AngleStatistics  #: the paper's, with Euclidean norms
     mutual_angle: AngleStatistics  #: the paper's, with Euclidean norms
-    leak: LeakStatistics  #: in the metric: what couples the inertias of task and coordinates
+    leak: LeakStatistics  #: in the metric; for A = M it measures the inertial coupling of task and coordinates
     metric_mutual_angle: AngleStatistics  #: between two coordinates, in the metric
     conditioning: Conditioning
     worst_point: tuple[float, ...]  #: the joint position with the smallest conditioning, of samples and search
     worst: WorstPoints | None  #: found by a search; None on a torus, at given joint positions, and for grown charts
-    singular_samples: int  #: samples left out: a gradient vanishes, or a grown coordinate has no value
-    held_speed: float  #: of the joints with xi held, over the least one: 90 % quantile, see `measure_held_speeds`
+    singular_samples: int  #: samples left out because a gradient vanishes or a coordinate is undefined
+    held_speed: float  #: joint speed with xi held over the least-norm speed, 90 % quantile, see `measure_held_speeds`
     length_ratio: float  #: 99 % over 1 % quantile of the gradient length, for the worst coordinate
     folded_samples: int  #: samples where det J has the opposite sign of most samples: the chart folds over
     idle_joints: tuple[str, ...]  #: names of joints that are exact coordinates themselves
-    without_idle: Angles | None  #: angles of the other coordinates; None if no joint, or every coordinate, is idle
-    contacts: ContactShare | None = None  #: postures in which the robot hits itself; None if not asked for
+    without_idle: Angles | None  #: angles of the other coordinates; None if no coordinate is an idle joint, or all are
+    contacts: ContactShare | None = None  #: samples in collision; None without a collision model
 
     @property
     def degenerate(self) -> bool:
@@ -426,7 +434,7 @@ class Report(Shown):
 
     def plot(self) -> Figure:
         """Histograms of angles and leaks, as a matplotlib figure; see `figures.quality_figure`."""
-        from orthocas.charts.figures import quality_figure  # with matplotlib, which takes long to import
+        from orthocas.charts.figures import quality_figure  # imports matplotlib, which takes long
 
         return quality_figure(self)
 
@@ -434,7 +442,7 @@ class Report(Shown):
         """Angles, conditioning, lengths, and the faults of the chart if there are any."""
         values = self.conditioning
         faults = {}
-        # what is wrong with the chart
+        # faults of the chart
         if self.folded_samples:
             at = ", ".join(f"{value:.2f}" for value in self.worst_point)
             share = percent(self.folded_samples / self.samples, 3, fault=True)
@@ -471,7 +479,7 @@ class Report(Shown):
             "mutual angle": paper(self.mutual_angle),
             "leak": f"rms {leak.rms:.2f}, mean {leak.mean:.2f}, largest sampled {leak.max:.1f} deg (in the metric)",
         }
-        # one coordinate has no mutual angles, and exact ones make means look better than the others are
+        # One coordinate has no mutual angles. Exact coordinates of idle joints make the means look better.
         if self.r == 1:
             found["mutual angle"] = "none, r = 1"
         if others is not None:
@@ -485,6 +493,7 @@ class Report(Shown):
 
     @property
     def _where(self) -> str:
+        """What the samples are a part of, for messages."""
         return "given points" if self.seed is None else "domain"
 
     def as_dict(self) -> dict[str, Any]:
