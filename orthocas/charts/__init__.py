@@ -2,13 +2,13 @@
 
     phi(q) = [h(q); xi(q)],  det dphi/dq != 0 on a domain
 
-`chart.Chart` holds both, and saves itself. `inverse` finds q for phi, by searches in `newton`, `curves`, `descent` and
-`inside`; `trackers` follow streams of phi. `self_motion` says how far xi reaches, and `walls` what stops it; `quality`
-and `point_quality` say how good a chart is, and `certificate` what is proved of it. `grow` makes charts along flows;
-`orthocas.fitting` fits them.
+`chart.Chart` holds both, and is stored in files by `chart_file`. `inverse` computes q from phi, with the searches of
+`newton`, `curves`, `descent` and `inside`; `trackers` follow streams of phi. `self_motion` computes the range of xi,
+and `walls` what limits it. `quality` and `point_quality` measure a chart, and `certificate` records what is proved of
+it. `grow` makes exact charts along flows; `orthocas.fitting` fits charts.
 
-This module itself gives ready charts of known arms, fitted and certified. `names` lists them, `load` gives a chart, and
-`card` describes how good it is, where it holds, and how it was made; docs/how-to/ready_charts.md shows all.
+The names of this package itself are for ready charts of known arms: `names` lists them, `load` loads one, and `card`
+describes its quality, its domain, and how it was made. See docs/how-to/ready_charts.md.
 """
 
 from orthocas.charts.ready import Card, Model, card, load, names

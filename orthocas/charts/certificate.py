@@ -1,4 +1,4 @@
-"""What a proof leaves behind in a chart file: the certificate, and the subdivision of the domain."""
+"""Certificates: the record of a proof in a chart file, with the subdivision of the domain that it covers."""
 
 import hashlib
 import json
@@ -12,56 +12,60 @@ from orthocas.tools.checks import Array, freeze_array, require_kind, require_sha
 from orthocas.tools.display import Shown, number_list, percent
 from orthocas.tools.json import collect_attributes
 
-OPEN, PROVED = 255, 254  #: codes of boxes that are not halved; others are the joint that is
-MOST_BOXES = 20_000_000  #: of a subdivision
-_DEEPEST = 1000  #: open halves at once, of a tree in a file
+OPEN, PROVED = 255, 254  #: codes of boxes that are not halved; a smaller code is the index of the joint that is halved
+MOST_BOXES = 20_000_000  #: largest number of boxes in a subdivision
+_DEEPEST = 1000  #: largest number of halves that wait at once while the tree of a file is read
 ELIMINATION = "taylor-3/2"  #: J by Taylor models and elimination. The one-to-one part of taylor-3/1 was unsound.
-COFACTORS = "cofactors-5/1"  #: det J of charts with one coordinate, by its expansion along the row of that coordinate
-METHODS = (ELIMINATION, COFACTORS)  #: of this version; certificates of other methods cannot be checked
+COFACTORS = "cofactors-5/1"  #: for r = 1: det J by expansion along the row of the coordinate
+METHODS = (ELIMINATION, COFACTORS)  #: methods of this version; certificates of other methods cannot be checked
 
 
 @dataclass(frozen=True, eq=False)
 class Subdivision:
-    """A box and its parts. Halves share the face between them exactly, so the parts cover the box.
+    """A box and its subdivision into parts by repeated halving: a binary tree.
+
+    Both halves of a box share the face between them exactly, so the parts cover the box without gaps.
 
     Raises:
-        InvalidValueError: if the codes are no tree.
+        InvalidValueError: if the codes do not form a tree, or the corners are invalid.
     """
 
     low: Array  #: corner of the box, (n,)
     high: Array  #: opposite corner, (n,)
-    codes: Array  #: uint8, in preorder: the joint whose interval is halved (lower half first), PROVED or OPEN
+    codes: Array  #: uint8, one for each box in preorder: the joint that is halved (lower half first), PROVED or OPEN
 
     def __post_init__(self) -> None:
         low = freeze_array("low", self.low, (None,))
         high = freeze_array("high", self.high, low.shape)
-        # one byte for each box: the joint that is halved, or how it ended
+        # one byte for each box
         codes = np.array(self.codes)
         if codes.dtype != np.uint8 or codes.ndim != 1 or not 0 < codes.size <= MOST_BOXES:
-            raise InvalidValueError("codes", f"{codes.dtype} of shape {codes.shape}", "bytes of a tree of boxes")
+            raise InvalidValueError(
+                "codes", f"{codes.dtype} of shape {codes.shape}", f"uint8 of shape (k,), 1 <= k <= {MOST_BOXES:,}"
+            )
         if not (low < high).all():
-            raise InvalidValueError("low", low.tolist(), "a corner below the opposite one")
+            raise InvalidValueError("low", low.tolist(), f"a corner below the opposite one at {high.tolist()}")
         n = len(low)
         require_shape("codes", codes.shape, (None,))
-        # boxes that are halved name one of the joints
+        # codes of halved boxes must be joints
         inner = codes < PROVED
         if (codes[inner] >= n).any():
             raise InvalidValueError(
-                "codes", int(codes[inner].max()), f"numbers of joints below {n}, {PROVED} or {OPEN}"
+                "codes", int(codes[inner].max()), f"indices of joints below {n}, {PROVED} or {OPEN}"
             )
-        # in the order of the codes, each halved box brings two: the tree ends with the last code, not before
+        # In preorder, each halved box adds two boxes to come. None must be missing at the end, and some before it.
         missing = 1 + np.cumsum(np.where(inner, 1, -1))
         if missing[-1] != 0 or (missing[:-1] <= 0).any():
-            raise InvalidValueError("codes", f"{codes.size} bytes", "a tree of boxes")
+            raise InvalidValueError("codes", f"{codes.size} bytes", "a complete tree, with two halves per inner box")
         if missing.max() > _DEEPEST:
-            raise InvalidValueError("codes", "a tree that is too deep", f"at most {_DEEPEST} open halves at once")
+            raise InvalidValueError("codes", "a tree that is too deep", f"at most {_DEEPEST} waiting halves at once")
         codes.setflags(write=False)
         for name, value in (("low", low), ("high", high), ("codes", codes)):
             object.__setattr__(self, name, value)
 
     @classmethod
     def whole(cls, low: Array, high: Array) -> Self:
-        """The box in one part, not proved."""
+        """The whole box as a single OPEN part."""
         return cls(low, high, np.array([OPEN], dtype=np.uint8))
 
     @property
@@ -81,7 +85,7 @@ class Subdivision:
 
     @property
     def complete(self) -> bool:
-        """Whether all parts are proved."""
+        """Whether every part is proved."""
         return not (self.codes == OPEN).any()
 
     @property
@@ -97,8 +101,8 @@ class Subdivision:
         return min(float((0.5 ** depths[self.codes == PROVED]).sum()), 1 - 2**-53)
 
     def leaves(self, code: int) -> tuple[Array, Array]:
-        """Corners (boxes, n) of the parts with a code, in preorder."""
-        # where the upper half of each part that is halved stands; the lower half follows it
+        """Lower and upper corners, (boxes, n) each, of the parts with a given code (PROVED or OPEN), in preorder."""
+        # place of the upper half of each halved box in the codes; the lower half comes directly after the box
         upper, waiting = np.zeros(self.codes.size, dtype=np.intp), list[int]()
         for k, number in enumerate(self.codes.tolist()):
             if number < PROVED:
@@ -107,7 +111,7 @@ class Subdivision:
                 upper[waiting.pop()] = k + 1
         parts = []
         place, low, high = np.zeros(1, dtype=int), self.low[None], self.high[None]
-        # One level of the tree at a time.
+        # compute the corners, one level of the tree at a time
         while place.size:
             codes = self.codes[place]
             parts.append((place[codes == code], low[codes == code], high[codes == code]))
@@ -124,32 +128,32 @@ class Subdivision:
 
 
 def halve_interval(low: Any, high: Any) -> Any:
-    """The numbers between two corners where boxes are halved."""
+    """The place where the interval [low, high] is halved. All users of a subdivision must round it in the same way."""
     return (low + high) / 2
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Certificate(Shown):
-    """A proof about the chart with this fingerprint; see `orthocas.certify`.
+    """The record of a proof about the chart with this fingerprint; see `orthocas.certify`.
 
-    The parts of `regular` that are proved cover a share of the domain on which det J has one sign and, if `bound` is
-    above 0, the conditioning is at least `bound`. On the box `injective`, two different q never share phi. Certificates
-    of other methods have no such box: theirs is void.
+    On the proved parts of `regular`, det J has one sign and, if `bound` > 0, the conditioning is at least `bound`. On
+    the box `injective`, phi is one-to-one: two different q never have the same phi. In certificates of older methods,
+    the proof of `injective` is void, so it is dropped.
     """
 
-    fingerprint: str  #: of all that defines J
+    fingerprint: str  #: digest of all that defines the chart
     method: str
-    bound: float  #: of the conditioning; 0: det J != 0 only
+    bound: float  #: required lower bound of the conditioning; 0: the proof is about det J != 0 only
     regular: Subdivision  #: the domain and its parts
-    conditioning: float  #: proven lower bound of the conditioning on the proved share; 0 if none was asked for
+    conditioning: float  #: proved lower bound of the conditioning on the proved parts; 0 if none was required
     injective: Subdivision | None = None  #: a box on which phi is one-to-one, and its parts
     fold: tuple[tuple[float, ...], ...] = ()  #: two joint positions where det J differs in sign, the second in the fold
-    boxes: int = 0  #: evaluated to find the proof
+    boxes: int = 0  #: number of boxes evaluated to find the proof
     seconds: float = field(default=0.0)
-    least_singular_value: float = 0.0  #: of a ClearBox; parts proved to lie outside it count as proved. 0: no ClearBox
-    least_volume: float = 0.0  #: of a RegularPart, which keeps folds out of what is not proved. 0: another domain
-    clear_share: float = 0.0  #: of the clear positions of a RegularPart's box, the share in proved parts, from samples
-    digest: str = ""  #: of all of the above, see `seal`
+    least_singular_value: float = 0.0  #: bound of a ClearBox; parts proved to lie outside it count as proved; 0: none
+    least_volume: float = 0.0  #: bound of a RegularPart, whose run-time check excludes folds; 0: another domain
+    clear_share: float = 0.0  #: share of the clear positions of a RegularPart's box in proved parts, from samples
+    digest: str = ""  #: digest of all fields above, see `seal`
 
     def __post_init__(self) -> None:
         for name in ("fingerprint", "method"):
@@ -161,17 +165,20 @@ class Certificate(Shown):
             object.__setattr__(self, "injective", None)
 
     def seal(self) -> Self:
-        """The same certificate with the digest of its content, which shows accidental changes. It is no signature."""
+        """The same certificate with the digest of its content, which reveals accidental changes. It is no signature."""
         return replace(self, digest=self._compute_digest())
 
     def remove_given_up(self, count: int) -> Self:
-        """This certificate without a number of parts that were given up, which older files have and no check covers."""
+        """Seal a certificate of an older file again, whose digest included the number of parts that were given up.
+
+        No check covers that number. If the digest does not match, the certificate stays, and `require_for` refuses it.
+        """
         return self.seal() if self.digest == self._compute_digest(count) else self
 
     def _compute_digest(self, given_up: int = 0) -> str:
-        """SHA-256 of all numbers and texts but the digest; older certificates also count parts that were given up."""
+        """SHA-256 of all fields except the digest. `given_up` is a number of parts that older certificates include."""
         numbers = [self.bound, self.conditioning, self.boxes, self.seconds, self.least_singular_value, given_up]
-        # Older certificates have no such numbers.
+        # Certificates of other domains, and older ones, lack these numbers.
         numbers += [self.least_volume, self.clear_share] if self.least_volume else []
         points = [[float(value) for value in point] for point in self.fold]
         content = [self.fingerprint, self.method, [float(number) for number in numbers], points]
@@ -182,7 +189,7 @@ class Certificate(Shown):
         return digest.hexdigest()
 
     def require_for(self, fingerprint: str) -> None:
-        """Raise CertifyError if the certificate is not that of the chart with this fingerprint, or has been changed."""
+        """Raise CertifyError if the certificate belongs to a chart with another fingerprint, or has been changed."""
         if self.digest and self.digest != self._compute_digest():
             raise CertifyError("the certificate is void: it has been changed since `certify` made it")
         if self.fingerprint != fingerprint:
@@ -195,16 +202,16 @@ class Certificate(Shown):
 
     @property
     def share(self) -> float:
-        """Share of the domain's volume that is proved, of the whole box for a ClearBox."""
+        """Share of the domain's volume on which the proof holds; for a ClearBox, of the volume of its box."""
         return 0.0 if self.fold else self.regular.share
 
     @property
     def unproved(self) -> tuple[Array, Array]:
-        """Corners (boxes, n) of the parts where nothing is proved."""
+        """Lower and upper corners, (boxes, n) each, of the parts where nothing is proved."""
         return self.regular.leaves(OPEN)
 
     def facts(self) -> dict[str, str]:
-        """What is proved, of how many boxes, and what is not."""
+        """What is proved and what is not, the number of boxes, and the method."""
         facts = {"certificate": self._describe()}
         # what is proved beyond "no fold"
         if self.conditioning > 0:
@@ -219,7 +226,7 @@ class Certificate(Shown):
             facts["left out"] = f"where the task's relative singular value is at most {self.least_singular_value:g}"
         if self.least_volume > 0 and not self.proved:
             facts["the rest"] = f"guarded at run time: the domain leaves out volumes up to {self.least_volume:g}"
-        # where a proof would have to go on
+        # the largest part that is not proved
         low, high = self.unproved
         if len(low) and not self.fold:
             largest = int(np.argmax((high - low).prod(axis=1)))
@@ -242,10 +249,11 @@ class Certificate(Shown):
         }
 
     def _describe(self) -> str:
+        """The verdict in one line."""
         if self.fold:
             at = ", ".join(f"{value:.3f}" for value in self.fold[-1])
             return f"refuted, the chart folds at q = ({at})"
-        # the verdict, with shares rounded down
+        # shares are rounded down
         verdict = "no fold everywhere on the domain"
         if not self.proved:
             share, clear = percent(self.share, 4), percent(self.clear_share, 3)

@@ -18,18 +18,18 @@ if TYPE_CHECKING:
     from orthocas.charts.quality import AngleStatistics, Report
 
 _MOST_POSTURES = 1000
-_PANELS = 2  #: side by side
+_PANELS = 2  #: largest number of panels side by side
 _TASK, _EXTRA, _LEAK = "#1f5fa8", "#d95f02", "#5a9e6f"
 
 
 def quality_figure(report: "Report") -> Figure:
-    """Histograms of task and mutual angles [deg], as in [AS2023] Figs. 20 and 27, and of leaks (ours)."""
+    """Plot histograms of task and mutual angles [deg], as in [AS2023] Figs. 20 and 27, and of leaks (ours)."""
     _require("report", report, "task_angle", "a Report")
     figure = Picture(figsize=(12.0, 3.4), layout="constrained")
     left, middle, right = figure.subplots(1, 3)
     _draw_angles(left, report.task_angle, _TASK, r"task angle $\angle(\mathrm{d}\xi_j, \nabla_A h_i)$")
     _draw_angles(middle, report.mutual_angle, _EXTRA, r"mutual angle $\angle(\mathrm{d}\xi_i, \mathrm{d}\xi_j)$")
-    # leaks begin at 0, in bins of half a degree
+    # leaks from 0, in bins of half a degree
     counts = report.leak.histogram[:900].reshape(-1, 5).sum(axis=1)
     right.stairs(counts / max(counts.sum(), 1) / 0.5, 0.5 * np.arange(len(counts) + 1) - 0.05, fill=True, color=_LEAK)
     right.set_xlim(0, max(6.0, 3 * report.leak.rms))
@@ -42,10 +42,10 @@ def quality_figure(report: "Report") -> Figure:
 
 
 def self_motion_figure(chart: "Chart", postures: int = 9) -> Figure:
-    """The self-motions of the arm: each panel sweeps one coordinate as far as it reaches, and holds all else.
+    """Plot self-motions of the arm: each panel moves one coordinate over its range, with the task and the others held.
 
     Args:
-        chart: the chart; the sweep starts at the home of its domain.
+        chart: the chart; the curves pass through the home of its domain.
         postures: number of postures per panel.
     """
     _require("chart", chart, "xi_range", "a Chart")
@@ -62,7 +62,7 @@ def self_motion_figure(chart: "Chart", postures: int = 9) -> Figure:
         panel = figure.add_subplot(rows, columns, j + 1, projection="3d")
         for points, colour in zip(chart.problem.robot.joint_points(sweep), colours, strict=True):
             panel.plot(*points.T, "-o", color=colour, markersize=3, linewidth=1.8)
-        # what a title claims is measured on the postures drawn
+        # the title states how far the task moves between the postures drawn, as a power of ten
         moved = np.abs(chart.x(sweep) - chart.x(chart.problem.domain.home)).max()
         low, high = chart.xi(sweep[[0, -1]])[:, j]
         title = rf"$\xi_{{{j + 1}}}$ from {low:.3g} to {high:.3g}, dark to light"
@@ -73,12 +73,13 @@ def self_motion_figure(chart: "Chart", postures: int = 9) -> Figure:
 
 
 def _draw_angles(axes: Axes, angles: "AngleStatistics", colour: str, label: str) -> None:
+    """Draw a histogram of angles around 90 degrees."""
     # groups of five bins, so that 90 degrees lies in the middle of its group
     first = 3
     counts = angles.histogram[first:-3].reshape(-1, 5).sum(axis=1)
     edges = (first - 0.5) / 10 + 0.5 * np.arange(len(counts) + 1)
     axes.stairs(counts / max(counts.sum(), 1) / 0.5, edges, fill=True, color=colour, alpha=0.85)
-    # as wide as the distribution, and never narrower than six degrees
+    # show five standard deviations on both sides, and at least six degrees
     width = max(6.0, 5 * (0.0 if np.isnan(angles.std) else angles.std))
     axes.set_xlim(90 - width, 90 + width)
     axes.set_xlabel(f"{label} [deg]")
@@ -87,6 +88,9 @@ def _draw_angles(axes: Axes, angles: "AngleStatistics", colour: str, label: str)
 
 
 def _require(name: str, value: object, part: str, wanted: str) -> None:
-    """Raise InvalidValueError unless the value has the part that is drawn; its class imports this module."""
+    """Raise InvalidValueError unless a value has an attribute `part`.
+
+    A check of its class would need an import of the module that imports this one.
+    """
     if not hasattr(value, part):
         raise InvalidValueError(name, f"a {type(value).__name__}", wanted)

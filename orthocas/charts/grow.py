@@ -1,4 +1,4 @@
-"""Grows a chart: chooses a base leaf, charts it, and carries its coordinates along the task gradients."""
+"""Growing of a chart: choose a base leaf, chart it, and carry its coordinates along the task gradients."""
 
 from __future__ import annotations
 
@@ -35,9 +35,9 @@ from orthocas.tools.checks import (
     require_shape,
 )
 
-_PROBES = 1000  # samples of the domain that are pulled to the leaf to find the extent that it needs
-_FEWEST_CELLS = 10  # along the longest edge of a region
-_MARGIN = 1.15  # of that region
+_PROBES = 1000  # samples of the domain that are pulled to the leaf to find the part of it that must be charted
+_FEWEST_CELLS = 10  # smallest number of mesh cells along the longest edge of a region
+_MARGIN = 1.15  # size of the default region, relative to the box of the pulled samples
 
 
 def grow(
@@ -55,18 +55,19 @@ def grow(
 
     Args:
         problem: a problem with m = 1, or with task gradients that are involutive in the metric.
-        level: task value x0 of the base leaf, a number or (m,); default the task value of the origin.
+        level: task value x0 of the base leaf, a number or (m,); default: the task value of `origin`, or of the centre
+            of the domain.
         leaf: how to chart the base leaf. "linear": xi0 = N^T (q - origin), for any n. "circle": by arc length, scaled
             to (-pi, pi], for a closed leaf with r = 1. "disk": by a harmonic map of a triangle mesh onto the unit disk,
             for n = 3, m = 1. Default: "circle" for r = 1 on a torus, "disk" for n = 3 and m = 1, otherwise "linear".
-        origin: joint position (n,) that is pulled to the origin of a "linear" or "circle" leaf; default the centre of
+        origin: joint position (n,) that is pulled to the origin of a "linear" or "circle" leaf; default: the centre of
             the domain, or another point of the domain if the flow from the centre is singular.
-        region: for "disk" only, the box that bounds the charted part of the leaf; default a box around all points that
-            the domain is pulled to, with a whole turn for every joint that turns fully in the domain.
-        cells: for "disk" only, number of mesh cells along the longest edge of the region; default 60.
+        region: for "disk" only: the box that bounds the charted part of the leaf. Default: a box around the points to
+            which the domain is pulled, with a whole turn for a joint that turns fully in the domain.
+        cells: for "disk" only: number of mesh cells along the longest edge of the region; default 60.
 
     Returns:
-        The chart. Its values are NaN where a flow runs into a singularity or ends outside the chart of the leaf;
+        The chart. Its values are NaN where the flow meets a singularity or ends outside the chart of the leaf;
         `chart.coordinates.pull(points).status` says where.
 
     Raises:
@@ -74,8 +75,8 @@ def grow(
             the path.
         NotADiskError: if the part of the leaf in the region is not a disk; the message says what it is.
         GrowError: if the flow does not reach the leaf, or the leaf does not close or cannot be charted.
-        MetricError: if the metric is not SPD on the domain.
-        InvalidValueError: if an argument has the wrong type, or belongs to another kind of leaf.
+        MetricError: if the metric is not symmetric positive definite on the domain.
+        InvalidValueError: if an argument has the wrong type, or applies to another kind of leaf.
 
     Example:
         >>> import numpy as np
@@ -95,7 +96,7 @@ def grow(
     if not isinstance(leaf, str):
         raise InvalidValueError("leaf", repr(leaf), f"one of {', '.join(LEAVES)}")
     require_known("leaf", leaf, LEAVES)
-    # raise InvalidValueError for options that would be ignored or make no sense
+    # options that apply to another kind of leaf, or have the wrong type
     for name, value in (("region", region), ("cells", cells)):
         if leaf != "disk" and value is not None:
             raise InvalidValueError(name, value, f"None for a {leaf} leaf, because {name} applies to disk leaves only")
@@ -141,9 +142,10 @@ def require_involutive(problem: Problem) -> None:
 def _leaf_chart(
     problem: Problem, leaf: str, x0: Array, origin: Array | None, region: Box | None, cells: int
 ) -> LeafChart:
+    """Chart the base leaf h(q) = x0; raises GrowError if it cannot be reached or charted."""
     if leaf == "disk":
         return build_disk_leaf(problem, x0, _region(problem, x0) if region is None else region, cells)
-    # the point of the leaf that the origin is pulled to, (n,)
+    # the point of the leaf to which the origin, or another point of the domain, is pulled
     if origin is not None:
         candidates = origin[None]
     else:
@@ -164,10 +166,10 @@ def _leaf_chart(
 
 
 def _region(problem: Problem, x0: Array) -> Box:
-    """A box around the part of the leaf that the domain is pulled to."""
+    """The default region of a disk leaf: a box around the points of the leaf to which the domain is pulled."""
     domain = problem.domain
     whole = (domain.half_width >= np.pi - 1e-9) & find_turning_joints(problem)
-    # cut the domain open, as in [AS2023] Sec. 5.2
+    # with several joints that turn fully, the domain itself is the region, cut open as in [AS2023] Sec. 5.2
     if whole.sum() > 1:
         return Box(domain.centre, domain.half_width)
     pulled = TaskFlow(problem).pull(sample_evenly(domain, _PROBES, 0), x0)

@@ -1,4 +1,4 @@
-"""What solvers, laws and generated code use of a chart: its functions, its differences, and its searches."""
+"""The internal parts of a chart for solvers, laws and generated code: functions, differences, and searches."""
 
 from __future__ import annotations
 
@@ -43,22 +43,22 @@ FUNCTIONS = ("xi", "phi", "jacobian", "second_derivative", "task", "task_jacobia
 
 @dataclass(frozen=True, eq=False)
 class ChartParts:
-    """What solvers, laws and generated code use of a chart; no interface for users."""
+    """The parts of a chart that solvers, laws and generated code use, built on first use. Not for users."""
 
     chart: Chart
 
     @cached_property
     def functions(self) -> BuiltOnUse[str, ca.Function]:
-        """The functions of `Chart.function`."""
+        """The CasADi functions of `Chart.function` by name."""
         return BuiltOnUse(self._build_function)
 
     def express(self, name: str, q: Any) -> Any:
-        """A function at a CasADi column (n, 1)."""
+        """The named function at a CasADi column q (n, 1), as an expression."""
         require_shape("q", q.shape, (self.chart.n, 1))
         return self.functions[name](q)
 
     def _build_function(self, name: str) -> ca.Function:
-        """A function of `FUNCTIONS` by name."""
+        """Build the function with a name of `FUNCTIONS`."""
         task = self.chart.problem.task
         if name == "task":
             return task.function
@@ -68,7 +68,7 @@ class ChartParts:
             return task.manipulability_function
         q, v, w = (ca.MX.sym(symbol, self.chart.n) for symbol in ("q", "v", "w"))
         inputs = {"q": q}
-        # task first, then coordinates
+        # stack the rows of the task and those of the coordinates
         own = self.chart.coordinates.functions
         if name == "inverse":
             return inverse_function(self.functions["phi"], self.phi_sizes, self.phi_map.difference)
@@ -79,14 +79,14 @@ class ChartParts:
         elif name == "jacobian":
             value = ca.vertcat(task.jacobian_function(q), own["jacobian"](q))
         else:
-            # d^2 phi [v, w] is linear in both, so that C calls it with any two directions
+            # d^2 phi [v, w] with two directions, because C evaluates it with different ones
             value = ca.vertcat(task.second_derivative_function(q, v, w), own["second_derivative"](q, v, w))
             inputs |= {"v": v, "w": w}
         return ca.Function(name, list(inputs.values()), [ca.densify(value)], list(inputs), [name])
 
     @cached_property
     def phi_sizes(self) -> Array:
-        """Sizes of the components of phi, (n,): how far task components move over the domain, and 1 for xi."""
+        """Sizes of the components of phi, (n,): the range of each task component over the domain, and 1 for xi."""
         return np.concatenate([measure_task_sizes(self.chart.problem), np.ones(self.chart.r)])
 
     @property
@@ -98,36 +98,36 @@ class ChartParts:
 
     @property
     def named_coordinates(self) -> tuple[str, ...]:
-        """Labels of the coordinates, with what the first ones are, or are like: 'xi1: like swivel [rad]'."""
+        """Labels of the coordinates, with their meaning if it is known, such as 'xi1: like swivel [rad]'."""
         labels, notes = self.chart.labels[self.chart.m :], self.chart.notes
         meaning, exact = notes.get("meaning"), "exact" in notes
         named = meaning.split("; ") if isinstance(meaning, str) else []
-        # older charts only name what they are like
+        # notes of older charts omit "like"
         named = [name if exact or name.startswith("like ") else f"like {name}" for name in named]
         return (*(f"{label}: {name}" for label, name in zip(labels, named, strict=False)), *labels[len(named) :])
 
     def runnable(self, graph: ca.Function) -> ca.Function:
-        """The fast form of a graph of this chart's functions: scalar code, or the graph itself for networks.
+        """The form of one of this chart's functions that runs fast: scalar code.
 
-        It is also the graph itself for robots with more than 10 joints.
+        For networks, and for robots with more than 10 joints, it is the given graph itself.
         """
         own = self.chart.coordinates
         return graph if isinstance(own, Coordinates) and own.as_matrices else choose_form(graph, self.chart.n)
 
     def left_over(self, q_start: ArrayLike, q: ArrayLike, tolerance: float = 1e-9) -> Array | None:
-        """What a loop in (x, xi) leaves over in the joints: q - q_start (n,), less full turns of endless joints.
+        """Change of the joints q - q_start after a loop in (x, xi), without full turns of unbounded joints.
 
-        phi is one-to-one near each point only, so x and xi may come back while the joints do not. A loop that can be
-        shrunk to a point, while its joints stay in the domain, leaves nothing over. A loop around a full turn of the
-        tool or the base cannot be shrunk, and closes only if xi does not change with the joint that turns.
+        phi is one-to-one only locally, so x and xi may return to their start while the joints do not. After a loop that
+        can be contracted to a point within the domain, the change is 0. A loop around a full turn of the tool or the
+        base cannot be contracted; its change is 0 only if xi does not depend on the joint that turns.
 
         Args:
-            q_start: where the loop began, (n,).
-            q: where it ended, (n,).
-            tolerance: of phi, relative to `phi_sizes`.
+            q_start: joint position at the start of the loop, (n,).
+            q: joint position at its end, (n,).
+            tolerance: largest difference of phi at both ends, relative to `phi_sizes`.
 
         Returns:
-            (n,) [rad] or [m]; None if x or xi differ, so that the path is open.
+            The change, (n,) [rad] or [m]; None if phi differs at both ends, so that the path is open.
         """
         start, end = as_point("q_start", q_start, self.chart.n), as_point("q", q, self.chart.n)
         apart = self.phi_map.difference(self.chart.phi(end), self.chart.phi(start)) / self.phi_sizes
@@ -135,12 +135,12 @@ class ChartParts:
 
     @cached_property
     def relative(self) -> Relative:
-        """Task values relative to wanted ones."""
+        """Errors and rates of the task relative to a target, see `Relative`."""
         return Relative(self.chart.problem.task)
 
     @cached_property
     def rates(self) -> ca.Function:
-        """q (n, 1) -> J (n, n) with the rows of `Relative.rates` for the task: for solvers and laws."""
+        """Function q (n, 1) -> J (n, n) with `Relative.rates` as task rows, for solvers and laws."""
         chart = self.chart
         if not self.relative.turned:
             return chart.function("jacobian")
@@ -149,7 +149,7 @@ class ChartParts:
         return ca.Function("rates", [q], [ca.densify(rows)], ["q"], ["rates"])
 
     def batched_rates(self, points: Array) -> Array:
-        """The rows of `rates` at points (N, n), (N, n, n); NaN where the task has no finite Jacobian."""
+        """J of `rates` at points (N, n), (N, n, n); NaN where the task Jacobian is not finite."""
         chart = self.chart
         J = np.empty((len(points), chart.n, chart.n))
         J[:, : chart.m] = self.relative.batched_rates(points)[0].reshape(-1, chart.m, chart.n)
@@ -158,32 +158,32 @@ class ChartParts:
 
     @cached_property
     def phi_map(self) -> PhiMap:
-        """phi and J for solvers of phi(q) = phi."""
+        """phi, J and scaled errors for solvers of phi(q) = phi."""
         chart = self.chart
         return PhiMap(chart.phi, self.batched_rates, self.phi_sizes, Differences(self.turns, self.relative))
 
     @cached_property
     def boxed(self) -> BoxedPhi:
-        """phi in the box of the domain."""
+        """phi in the box of the domain, for descents and searches."""
         return BoxedPhi(self.chart.problem.task, self.chart.problem.domain, self.phi_map, self.chart.xi)
 
     @cached_property
     def tracer(self) -> CurveTracer:
-        """Traces self-motion curves, r = 1."""
+        """The tracer of self-motion curves, for r = 1."""
         return CurveTracer(self.boxed)
 
     @cached_property
     def motion_kernel(self) -> MotionKernel | None:
-        """Follows self-motions in C, r = 1; None where Python does."""
+        """The C kernel that follows self-motions, for r = 1; None if it cannot be used, so that Python does it."""
         kernel = MotionKernel(self.chart)
         return kernel if has_library(kernel) else None
 
     @cached_property
     def turn_shifts(self) -> dict[str, Array]:
-        """What a full turn of a joint that turns without end adds to xi everywhere, (r,) by the joint's name.
+        """Changes of xi by a full turn of each unbounded joint, (r,), by the joint's name.
 
-        One posture then has many values of xi, these apart. Joints whose turns do not change xi are missing, and so are
-        those whose turns change it by different amounts in different postures.
+        Each posture then has several values of xi, which differ by multiples of this change. Left out are joints whose
+        turns do not change xi, and joints whose turns change it by different amounts in different postures.
         """
         chart, shifts = self.chart, {}
         q = sample_uniform(chart.problem.domain, 8, 0)
@@ -196,9 +196,9 @@ class ChartParts:
 
     @cached_property
     def inverse(self) -> Inverse:
-        """The search of `Chart.solve`."""
+        """The searches of `Chart.solve`."""
         chart, phi_map, domain = self.chart, self.phi_map, self.chart.problem.domain
-        # grown coordinates bring their own inverse
+        # grown coordinates have an inverse map of their own
         starts = Starts(phi_map, domain)
         if isinstance(chart.coordinates, InvertibleMap):
             own = OwnInverse(chart.coordinates, phi_map)
@@ -213,13 +213,13 @@ class ChartParts:
 
     @cached_property
     def point_functions(self) -> PointFunctions:
-        """The functions that trackers and `solve` call for one row."""
+        """The functions that trackers, and `solve` for few rows, call for one joint position."""
         phi_map = self.phi_map
         phi = self.chart.function("phi")
         return PointFunctions.of(phi, self.rates, phi_map.sizes, phi_map.difference, self.chart.problem.turning)
 
     @cached_property
     def reaching(self) -> ca.Function:
-        """The function of `ReachingTracker`: see `near_function`."""
+        """The function of errors and constraints for `ReachingTracker`, see `near_function`."""
         chart = self.chart
         return near_function(chart.function("phi"), self.rates, chart.m, self.phi_map, chart.problem.domain)

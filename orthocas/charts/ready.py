@@ -1,4 +1,4 @@
-"""Ready charts of known arms: the catalogue, and a card for each."""
+"""Ready charts of known arms: their names, loading, and a card with the facts of each."""
 
 from __future__ import annotations
 
@@ -19,44 +19,44 @@ _CARD = ".json"
 
 @dataclass(frozen=True)
 class Model:
-    """Where the numbers of a robot come from. A chart file includes them, so their licence travels with it."""
+    """The origin of a robot model. A chart file includes the model, so its licence applies to the file."""
 
     robot: str  #: maker and type
     file: str  #: the robot file
-    package: str  #: what the file was taken from, with its version
-    upstream: str  #: its origin before that
-    licence: str  #: its SPDX identifier; the text is in orthocas/charts/licences
-    holder: str  #: who holds the copyright
+    package: str  #: the package from which the file was taken, with its version
+    upstream: str  #: the original source of the file
+    licence: str  #: SPDX identifier of the licence; its text is in orthocas/charts/licences
+    holder: str  #: holder of the copyright
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Card(Shown):
-    """What is known of a ready chart. Angles are in degrees, joint positions in rad or m."""
+    """The facts of a ready chart. Angles are in degrees, joint positions in rad or m."""
 
     name: str
     model: Model
     task: str
     coordinates: str  #: the parametrisation
     joints: tuple[str, ...]
-    cyclic_joints: tuple[str, ...]  #: joints whose positions all belong to the domain
+    cyclic_joints: tuple[str, ...]  #: joints at all whose positions the chart is valid
     centre: tuple[float, ...]
     half_width: tuple[float, ...]
-    quality: Mapping[str, Any]  #: as printed by `orthocas evaluate --json`
-    proved_parts: int  #: parts of the domain in the proof that the chart does not fold; 0 for wide charts
-    fingerprint: str  #: of the chart
-    commands: tuple[str, ...]  #: that made the chart
-    branch: str = ""  #: of wide charts
-    regular_share: float = 1.0  #: of the branch's clear positions, those in the domain
+    quality: Mapping[str, Any]  #: report of the chart, as printed by `orthocas evaluate --json`
+    proved_parts: int  #: number of parts of the domain in the proof that the chart does not fold; 0 for wide charts
+    fingerprint: str  #: fingerprint of the chart, see `Certificate`
+    commands: tuple[str, ...]  #: commands that made the chart
+    branch: str = ""  #: name of the branch, for wide charts
+    regular_share: float = 1.0  #: share of the branch's clear positions that lie in the domain
 
     @classmethod
     def from_json(cls, text: str) -> Self:
-        """Read what `to_json` wrote."""
+        """Read a card from the text of `to_json`."""
         data = json.loads(text)
         lists = {name: tuple(value) for name, value in data.items() if isinstance(value, list)}
         return cls(**data | lists | {"model": Model(**data["model"])})
 
     def to_json(self) -> str:
-        """The card as text."""
+        """The card as JSON text."""
         return json.dumps(asdict(self), indent=1, ensure_ascii=False) + "\n"
 
     def as_dict(self) -> dict[str, Any]:
@@ -65,7 +65,7 @@ class Card(Shown):
 
     @property
     def licence_text(self) -> str:
-        """The copyright lines of the robots of all ready charts, then the licence of this one's model."""
+        """The copyright notices of all ready charts' robots, then the text of this model's licence."""
         folder = files(__package__) / "licences"
         return "\n".join((folder / f"{name}.txt").read_text("utf-8") for name in ("NOTICE", self.model.licence))
 
@@ -98,6 +98,7 @@ class Card(Shown):
 
 
 def _spread(angles: Mapping[str, float]) -> str:
+    """Mean and standard deviation of angles in words."""
     return f"mean {angles['mean']:.2f}, std {angles['std']:.2f} deg"
 
 
@@ -107,19 +108,19 @@ def names() -> tuple[str, ...]:
 
 
 def load(path: str | Path) -> Chart:
-    """A chart from its file, or a ready chart by its name. Loading never runs code from a file.
+    """Load a chart from its file, or a ready chart by its name. Loading never runs code from a file.
 
-    Ready charts include the robot's model and, unless they are wide ones, a proof that they do not fold.
+    Ready charts include the robot model and, except for wide charts, a proof that they do not fold.
 
     Args:
-        path: of a chart file, or the name of a ready chart where there is no such file.
+        path: path of a chart file, or the name of a ready chart. A file with that name takes precedence.
 
     Returns:
-        The chart; a grown one as a `GrownChart`.
+        The chart; a `GrownChart` if its coordinates are grown.
 
     Raises:
-        UnknownNameError: for a word that is neither a file nor the name of a ready chart.
-        ChartFileError: if the file is missing, truncated, foreign, edited, or from a newer version.
+        UnknownNameError: if a name without folder and suffix is neither a file nor a ready chart.
+        ChartFileError: if the file is missing, truncated, edited, not a chart file, or from a newer version.
 
     Example:
         >>> from pathlib import Path
@@ -138,7 +139,7 @@ def load(path: str | Path) -> Chart:
         True
     """
     file = as_path("path", path)
-    # Files come first; a word without folder and suffix that is no file is meant as a name.
+    # A word without folder and suffix that is no file is taken as the name of a ready chart.
     if file.exists() or file.suffix or len(file.parts) > 1:
         return load_file(file)
     require_known("chart file or ready chart", file.name, names())
@@ -150,7 +151,7 @@ def card(name: str) -> Card:
     """The card of a ready chart: quality, domain, model with its licence, and the commands that made it.
 
     Raises:
-        UnknownNameError: if there is no chart of that name.
+        UnknownNameError: if no ready chart has that name.
 
     Example:
         >>> import orthocas as oc
