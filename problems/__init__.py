@@ -1,6 +1,6 @@
-"""Named problems: the arms of [AS2023], planar ones (links of 1 m and 3 kg are ours) and the KUKA LBR iiwa 7 R800.
+"""Named problems: the planar arms and the KUKA LBR iiwa 7 R800 of [AS2023], and a hexarotor (`propellers`).
 
-`propellers` has one that is no arm.
+The links of the planar arms weigh 3 kg, as those of the paper's 3R arm. They are 1 m long, which is our choice.
 """
 
 from collections.abc import Callable
@@ -19,9 +19,9 @@ from orthocas.tools.checks import require_known
 
 __all__ = ["get", "names"]
 
-CENTRE = (0.0, 0.52, 0.0, -1.05, 0.0, 0.79, 0.0)  #: q0 of the iiwa [rad]
-HALF_WIDTH = np.pi / 4  #: of its box [rad]
-_BENT = Box((0.6, 0.8, 0.8), np.pi / 8)  #: of the planar arms [rad]; neither task is singular here
+CENTRE = (0.0, 0.52, 0.0, -1.05, 0.0, 0.79, 0.0)  #: centre q0 of the iiwa's box [rad]
+HALF_WIDTH = np.pi / 4  #: half-width of the iiwa's box [rad]
+_BENT = Box((0.6, 0.8, 0.8), np.pi / 8)  #: domain of the planar 3R arm [rad], on which neither task is singular
 
 
 def names() -> tuple[str, ...]:
@@ -40,11 +40,12 @@ def get(name: str) -> Problem:
 
 
 def _arm(joints: int) -> Robot:
+    """A planar arm with links of 1 m and 3 kg."""
     return Robot.planar(lengths=[1.0] * joints, masses=[3.0] * joints)
 
 
 def planar_2r() -> Problem:
-    """Two joints, task x of the tip, A = I, whole torus ([AS2023] Sec. 6.1).
+    """Planar arm with two joints, task x of the tip, A = I, domain the whole torus ([AS2023] Sec. 6.1).
 
     Self-motion manifolds are circles here, so no smooth coordinate is good everywhere. Expect bad regions near the
     singularities of the task.
@@ -54,30 +55,30 @@ def planar_2r() -> Problem:
 
 
 def planar_3r_x() -> Problem:
-    """Three joints, task x of the tip, A = M. Exact coordinates exist. The box avoids singularities (ours)."""
+    """Planar arm with three joints, task x of the tip, A = M; exact coordinates exist. The box is our choice."""
     robot = _arm(3)
     return Problem(robot, Task.position(robot, "x"), "inertia", _BENT, "planar_3r_x")
 
 
 def planar_3r_xy() -> Problem:
-    """Three joints, task (x, y) of the tip, A = M. No exact coordinates exist. Same box as planar_3r_x (ours)."""
+    """Planar arm with three joints, task (x, y) of the tip, A = M; no exact coordinates exist. Box: our choice."""
     robot = _arm(3)
     return Problem(robot, Task.position(robot, "xy"), "inertia", _BENT, "planar_3r_xy")
 
 
 def urdf_path() -> AbstractContextManager[Path]:
-    """The path of the arm's URDF file, valid while the context is open."""
+    """The path of the iiwa's URDF file, valid while the context is open."""
     return as_file(files(__package__) / "data" / "iiwa7_r800.urdf")
 
 
 def iiwa_robot() -> Robot:
-    """The arm with its tip at the flange (link_ee)."""
+    """The KUKA LBR iiwa 7 R800 with its tip at the flange (link_ee)."""
     with urdf_path() as path:
         return Robot.from_urdf(path, tip="link_ee")
 
 
 def iiwa() -> Problem:
-    """Seven joints, flange position, A = I, hypercube with edges of pi/2 around q0."""
+    """KUKA iiwa, task position of the flange, A = I, hypercube with edges of pi/2 rad around q0 ([AS2023] Sec. 9)."""
     arm = iiwa_robot()
     return Problem(arm, Task.position(arm), "euclidean", Box(CENTRE, HALF_WIDTH), "iiwa")
 

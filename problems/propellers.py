@@ -1,9 +1,10 @@
-"""A hexarotor whose propellers make a wrench: a problem that is no arm, with exact coordinates for m = 4.
+"""A hexarotor whose spin rates produce a wrench: a problem without an arm, with exact coordinates for m = 4.
 
-Thrusts grow with the square of the spin rates, so a wrench h(w) = B f(w) has components f_k(w_k) = w_k^2. Its gradients
-are the fields X_j with X_j,k = B_jk f_k'(w_k). Each component depends on its own w_k only, so
-[X_i, X_j]_k = (B_ik B_jk - B_jk B_ik) f_k' f_k'' = 0: they commute, and exact coordinates exist ([F2026]). In
-s_k = int dw_k / f_k' = ln(w_k) / 2, the fields are the constant rows of B, and xi = N^T ln(w) with B N = 0.
+The thrusts are the squares of the spin rates w, so the wrench is h(w) = B f(w) with f_k = w_k^2. The task gradients are
+the vector fields X_j with the components X_j,k = B_jk f_k'(w_k). Component k depends on w_k only, so
+[X_i, X_j]_k = (B_ik B_jk - B_jk B_ik) f_k' f_k'' = 0. The fields commute, so exact coordinates exist ([F2026]). In the
+variables s_k = int dw_k / f_k' = ln(w_k) / 2, the fields are the constant rows of B, which gives xi = N^T ln(w) with
+B N = 0.
 """
 
 import casadi as ca
@@ -18,12 +19,15 @@ from orthocas.tasks.task import Task
 from orthocas.tools.checks import Array
 
 PROPELLERS = 6
-DRAG = 0.2  #: torque of a propeller about its axis, relative to its thrust times the length of an arm
-HALF_WIDTH = 0.4  #: of the spin rates, relative to those of hovering
+DRAG = 0.2  #: torque of a propeller about its axis, relative to thrust times distance from the centre
+HALF_WIDTH = 0.4  #: half-width of the domain, relative to the spin rate of hovering
 
 
 def allocation() -> Array:
-    """B: thrust, roll, pitch and yaw of unit thrusts, with those of hovering adding up to 1, (4, 6)."""
+    """The matrix B (4, 6): total thrust and roll, pitch and yaw torques of the propellers at unit spin rates.
+
+    It is scaled so that the total thrust is 1 in hovering, where all spin rates are 1.
+    """
     angle = np.arange(PROPELLERS) * np.pi / 3
     yaw = DRAG * (-1.0) ** np.arange(PROPELLERS)
     return np.stack([np.ones(PROPELLERS), np.sin(angle), -np.cos(angle), yaw]) / PROPELLERS
@@ -35,7 +39,7 @@ def logarithms(w: ca.SX) -> ca.SX:
 
 
 def hexarotor() -> Problem:
-    """Six spin rates relative to hovering, the wrench along the axes that they turn, A = I ([F2026])."""
+    """Hexarotor: six spin rates relative to hovering as joints, task thrust and three torques, A = I ([F2026])."""
     robot = Robot(_sliders(PROPELLERS))
     task = Task.custom(
         robot, "wrench", lambda w: ca.DM(allocation()) @ w**2, ("thrust", "roll", "pitch", "yaw"), ("", "", "", "")
@@ -44,7 +48,7 @@ def hexarotor() -> Problem:
 
 
 def _sliders(count: int) -> KinematicTree:
-    """Independent numbers as a tree: unit masses that slide along z from a common base."""
+    """A kinematic tree for independent variables: unit masses that slide along z from a common base."""
     unit, zeros, none = np.tile(np.eye(3), (count, 1, 1)), np.zeros((count, 3)), np.full(count, np.inf)
     return KinematicTree(
         joint_names=tuple(f"w{k + 1}" for k in range(count)),

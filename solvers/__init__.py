@@ -18,7 +18,7 @@ SOLVERS: dict[str, type[GaussNewton] | type[LBFGS] | type[Ipopt] | type[Adam] | 
 
 
 def get(name: str) -> Solver:
-    """The solver with a name, with its default settings.
+    """The solver with the given name, in its default settings.
 
     Raises:
         UnknownNameError: if no solver has that name.

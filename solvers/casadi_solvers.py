@@ -1,4 +1,4 @@
-"""Solvers that come with CasADi: Ipopt, the gradient flow by CVODES, and the nodes that call NumPy from them."""
+"""Solvers through CasADi: Ipopt, and the gradient flow by CVODES; and the nodes by which they call NumPy."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -63,7 +63,7 @@ class Ipopt:
 
 
 class _IpoptRun:
-    """One minimisation: CasADi functions around the objective, and their results."""
+    """The state of one minimisation by Ipopt: the objective as CasADi nodes, cached values, and the best point."""
 
     def __init__(self, settings: Ipopt, objective: Objective, theta0: Array, watch: Watch) -> None:
         self.settings, self.objective = settings, objective
@@ -75,16 +75,16 @@ class _IpoptRun:
         self._constraints_at: tuple[bytes, Array, Array] | None = None
         self._count = 0
         self._current = self.best.theta
-        # violation of the constraints
+        # the least violation of the constraints so far, and its theta
         self._least = np.inf, self._current
 
     def result(self) -> SolveResult:
-        """Minimise. If no point meets the constraints, theta is the point with the smallest violation."""
+        """Run Ipopt. If no point meets the constraints, theta is the point with the smallest violation."""
         start = {"x0": ca.DM(self._current)}
         if self.constrained:
             start |= {name: ca.DM(bound) for name, bound in zip(("lbg", "ubg"), self.constrained.bounds, strict=True)}
         try:
-            # signals and exceptions wait until compiled code is done
+            # Ctrl-C and exceptions of nodes are raised after the compiled code has returned
             with deferred():
                 with building:
                     solver = self._solver()
@@ -103,8 +103,9 @@ class _IpoptRun:
         return replace(self.best.result(Status.INFEASIBLE), status=status)
 
     def _solver(self) -> ca.Function:
+        """Build Ipopt for the objective."""
         x, p = ca.MX.sym("x", self.size), ca.MX.sym("p", 0)
-        # values and gradients come from Python, through nodes
+        # values and gradients come from NumPy, through nodes
         value = self._node("f", [self.size], [(1, 1)], lambda theta: [self._evaluate(theta)[0]])
         both = self._node("grad_f", [self.size], [(1, 1), (self.size, 1)], self._evaluate)
         problem: dict[str, Any] = {"x": x, "f": value(x)}
@@ -124,7 +125,7 @@ class _IpoptRun:
             options["hess_lag"] = ca.Function("nlp_hess_l", [x, p, lam_f, lam_g], [upper])
         else:
             options |= {"ipopt.hessian_approximation": "limited-memory", "ipopt.limited_memory_max_history": 20}
-        # Ipopt calls the watcher at the start and after every iteration; an error there stops it.
+        # Ipopt calls the watcher at the start and after every iteration. A result of 1 stops it.
         lengths = {"x": self.size, "f": 1, "g": rows, "lam_x": self.size, "lam_g": rows}
         names = [ca.nlpsol_out(i) for i in range(ca.nlpsol_n_out())]
         watcher = ArrayNode("watch", [lengths.get(name, 0) for name in names], [(1, 1)], self._iterated)
@@ -147,18 +148,19 @@ class _IpoptRun:
         return ca.nlpsol("ipopt", "ipopt", problem, options)
 
     def _node(self, name: str, rows: list[int], shapes: list[tuple[int, int]], compute: Any) -> "ArrayNode":
+        """Make an `ArrayNode` and keep it, so that its exceptions can be raised later."""
         node = ArrayNode(name, rows, shapes, compute)
         self._nodes.append(node)
         return node
 
     def _evaluate(self, theta: Array) -> tuple[float, Array]:
-        """Value and gradient; cached, because Ipopt asks for them one after the other at the same point."""
+        """L(theta) and its gradient; cached, because Ipopt asks for them one after the other at the same point."""
         key = theta.tobytes()
         if self._at is None or self._at[0] != key:
             value, gradient = self.objective.value_and_gradient(theta)
             self.best.evaluations += 1
             self._at, self._current = (key, value, gradient), theta
-            # The largest constraint violation; 0 without constraints.
+            # largest violation of a constraint; 0 without constraints, infinite if L is not finite
             violation = 0.0 if np.isfinite(value) else np.inf
             if self.constrained and np.isfinite(value):
                 (lower, upper), values = self.constrained.bounds, self._constraints(theta)[0]
@@ -170,7 +172,7 @@ class _IpoptRun:
         return self._at[1], self._at[2]
 
     def _constraints(self, theta: Array) -> tuple[Array, Array]:
-        """Values and Jacobian; cached, because Ipopt asks for them several times at the same point."""
+        """Constraints and their Jacobian; cached, because Ipopt asks for them several times at the same point."""
         assert self.constrained is not None
         key = theta.tobytes()
         if self._constraints_at is None or self._constraints_at[0] != key:
@@ -178,12 +180,14 @@ class _IpoptRun:
         return self._constraints_at[1], self._constraints_at[2]
 
     def _hessian(self, theta: Array, factor: Array, multipliers: Array) -> list[Array]:
+        """Hessian of the Lagrangian, factor L + multipliers . c, (size, size)."""
         if self.constrained:
             return [self.constrained.lagrangian_hessian(theta, float(factor[0]), multipliers)]
         assert isinstance(self.objective, SmoothObjective)
         return [factor[0] * self.objective.hessian(theta)]
 
     def _iterated(self, *_: Array) -> list[float]:
+        """Count an iteration, except at the start; 1 stops Ipopt, because a node has failed."""
         if self._count:
             self.best.next_iteration(self.settings.max_iterations)
         self._count += 1
@@ -192,14 +196,14 @@ class _IpoptRun:
 
 @dataclass(frozen=True)
 class GradientFlow:
-    """Follows the path of steepest descent: slow, but with the same limit as gradient descent with tiny steps.
+    """Integrates dtheta/dt = -grad L(theta): slow, but with the same limit as gradient descent with tiny steps.
 
     Time is divided into intervals, each twice as long as the previous one. The flow is stiff, so CVODES takes implicit
     BDF steps. Their Jacobian is the Hessian if the objective has one, or else the Gauss-Newton matrix. If it has
     neither, as for networks, a Krylov method uses finite differences of the gradient.
 
-    A run ends as STALLED where an interval needs more than `max_steps` steps. In networks that happens long before a
-    minimum: where the loss curves downwards, no step can be longer than the time in which neighbours move apart.
+    A run ends as STALLED if an interval needs more than `max_steps` steps. For networks, this happens long before a
+    minimum: where the loss has negative curvature, neighbouring solutions diverge, and steps must stay short.
 
     Args:
         max_iterations: largest number of intervals.
@@ -223,7 +227,7 @@ class GradientFlow:
             require_count("max_steps", self.max_steps)
 
     def coarser(self) -> "GradientFlow":
-        """The same solver with ten times the tolerance."""
+        """The same solver with ten times the tolerance on the loss."""
         return replace(self, tolerance=10 * self.tolerance)
 
     def minimise(self, objective: Objective, theta0: Array, watch: Watch = UNWATCHED) -> SolveResult:
@@ -233,22 +237,24 @@ class GradientFlow:
 
 
 class _Flow:
-    """State of one flow."""
+    """The state of one run of `GradientFlow`."""
 
     def __init__(self, settings: GradientFlow, objective: Objective, theta0: Array, watch: Watch) -> None:
         self.settings, self.objective = settings, objective
         self.best = BestPoint(objective, theta0, watch)
         self.theta = np.array(theta0, dtype=float)
+        # L(theta), and the length of the next interval of time
         self.value, self.stretch = np.nan, 0.0
-        # of the theta that the flow starts from
+        # scale of the absolute tolerance: the largest entry of theta0
         self.scale = float(np.abs(self.theta).max() or 1.0)
         self.direct = isinstance(objective, SmoothObjective | LeastSquaresObjective)
         self._last = np.full_like(self.theta, np.nan), self.theta
         self._kept, self._uses = (self._last[0], np.empty((0, 0))), 0
 
     def iterate(self) -> Status:
+        """Follow the flow interval by interval until the loss falls no more; return how it ended."""
         best, limit = self.best, self.settings.max_iterations
-        # The first stretch moves theta by a small part of its length; without a gradient there is nowhere to flow.
+        # The first interval moves theta by a small part of its length. At a zero gradient the flow is at rest.
         self.value, gradient = best.value_and_gradient(self.theta)
         if not np.isfinite(self.value):
             return Status.FAILED
@@ -258,7 +264,7 @@ class _Flow:
         self.stretch = RULES.first_interval * length / float(np.linalg.norm(gradient))
         with deferred(), building:
             integrator, node = self._build_integrator()
-        # Intervals along the flow, each twice as long as the one before, until the value falls no more.
+        # intervals, each twice as long as the one before
         while best.iterations < limit:
             if not self._advance(integrator, node):
                 return Status.STALLED
@@ -273,10 +279,10 @@ class _Flow:
         return Status.ITERATION_LIMIT
 
     def _advance(self, integrator: ca.Function, node: "ArrayNode") -> bool:
-        """Follow the flow for one interval, and return whether the integrator reached the end."""
-        self._uses = RULES.most_uses  # a new Jacobian
+        """Follow the flow for one interval; return whether the integrator reached the end with a finite theta."""
+        self._uses = RULES.most_uses  # forces a new Jacobian
         try:
-            # An error of ours comes out as one of CasADi; only without one has the integrator given up.
+            # CasADi raises RuntimeError both for an exception in a node and if the integrator gives up.
             with deferred():
                 end = integrator(x0=self.theta, p=self.stretch)["xf"]
         except RuntimeError:
@@ -287,15 +293,15 @@ class _Flow:
         return bool(np.isfinite(self.theta).all())
 
     def _build_integrator(self) -> tuple[ca.Function, "ArrayNode"]:
-        """CVODES for dtheta/ds = -stretch grad L from s = 0 to 1, and the node of -grad L, with a Jacobian."""
+        """CVODES for dtheta/ds = -stretch grad L from s = 0 to 1, and the node of -grad L that it evaluates."""
         size, jacobian, along = self.theta.size, None, None
-        # Newton's method in CVODES takes a matrix, and Krylov methods its product with a direction.
+        # CVODES needs a Jacobian for Newton's method with a direct solver, or directional derivatives for GMRES.
         if self.direct:
             jacobian = ArrayNode("flow_jacobian", [size], [(size, size)], lambda theta: [-self._curvature(theta)])
         else:
             along = ArrayNode("flow_along", [size, size], [(size, 1)], lambda *at: [self._curvature_along(*at)])
         node = ArrayNode("flow", [size], [(size, 1)], self._descend, jacobian=jacobian, forward=along)
-        # The stretch scales time, so that each interval ends at s = 1.
+        # time is scaled by the length of the interval, so that each one ends at s = 1
         x, stretch = ca.MX.sym("x", size), ca.MX.sym("stretch")
         system: dict[str, Any] = {"x": x, "p": stretch, "ode": stretch * node(x)}
         options: dict[str, Any] = {
@@ -310,12 +316,13 @@ class _Flow:
         return ca.integrator("flow", "cvodes", system, 0.0, 1.0, options), node
 
     def _descend(self, theta: Array) -> list[Array]:
+        """-grad L at theta, kept for finite differences."""
         self._last = theta, -self.best.value_and_gradient(theta)[1]
         return [self._last[1]]
 
     def _curvature(self, theta: Array) -> Array:
-        """The Hessian or the Gauss-Newton matrix at theta, or near it. CVODES asks for it twice in a row."""
-        # The last matrix serves near its place, a few times.
+        """The Hessian or the Gauss-Newton matrix at theta, or at a point near it."""
+        # The last matrix is used a few times near its theta, also because CVODES asks for it twice in a row.
         at, kept = self._kept
         self._uses += 1
         if self._uses <= RULES.most_uses and np.linalg.norm(theta - at) <= RULES.moved * np.linalg.norm(theta):
@@ -330,11 +337,11 @@ class _Flow:
         return matrix
 
     def _curvature_along(self, theta: Array, direction: Array) -> Array:
-        """Change of the descent along a direction, by one finite difference."""
+        """Directional derivative of -grad L at theta along a direction, by one finite difference."""
         length = float(np.linalg.norm(direction))
         if length == 0:
             return np.zeros_like(direction)
-        # A difference along a step that is short beside theta.
+        # the step is short relative to theta
         step = RULES.difference * max(float(np.linalg.norm(theta)), 1.0) / length
         at, here = self._last
         if not np.array_equal(at, theta):
@@ -344,10 +351,10 @@ class _Flow:
 
 
 class ArrayNode(DenseNode):
-    """A function of columns whose outputs are computed in NumPy.
+    """A CasADi function of columns whose outputs are computed in NumPy.
 
-    Exceptions, Ctrl-C included, cannot pass through the code of the solver. The node keeps an exception in `error` and
-    fails this evaluation and all later ones, so that the solver soon gives up.
+    Exceptions, including Ctrl-C, cannot pass through the compiled solver. So the node stores an exception in `error`,
+    and fails this evaluation and all later ones, which makes the solver give up soon.
 
     Args:
         name: name of the function.
@@ -372,12 +379,12 @@ class ArrayNode(DenseNode):
         DenseNode.__init__(self, name, [(count, 1) for count in rows], shapes)
 
     def eval_buffer(self, arg: Sequence[Any], res: Sequence[Any]) -> int:
-        """Evaluate the outputs; the return value 1 means to CasADi that the evaluation failed."""
+        """Evaluate the outputs into `res`. Returns 1, which means failure in CasADi, after an exception; else 0."""
         if self.error is not None:
             return 1
         try:
             check()
-            # CasADi passes None for zeros.
+            # CasADi passes None for an input of zeros
             results = self._compute(
                 *(
                     np.zeros(count) if memory is None else np.frombuffer(memory).copy()
@@ -393,13 +400,13 @@ class ArrayNode(DenseNode):
         return 0
 
     def has_jacobian(self) -> bool:
-        """Whether a derivative was given."""
+        """Whether the node has a Jacobian."""
         return self._jacobian is not None
 
     def get_jacobian(
         self, name: str, inames: Sequence[str], onames: Sequence[str], opts: Mapping[str, Any]
     ) -> ca.Function:
-        """The derivative in CasADi's form, as a function of the inputs and an unused output."""
+        """The Jacobian in the form that CasADi requires: a function of the inputs and an unused output."""
         if self._jacobian is None:
             raise NotImplementedError(name)
         inputs = [ca.MX.sym("x", rows) for rows in self._rows]
@@ -407,13 +414,13 @@ class ArrayNode(DenseNode):
         return ca.Function(name, [*inputs, unused], [self._jacobian(*inputs)], list(inames), list(onames), dict(opts))
 
     def has_forward(self, nfwd: int) -> bool:
-        """Whether a directional derivative was given."""
+        """Whether the node has a directional derivative."""
         return self._forward is not None and nfwd == 1
 
     def get_forward(
         self, nfwd: int, name: str, inames: Sequence[str], onames: Sequence[str], opts: Mapping[str, Any]
     ) -> ca.Function:
-        """The directional derivative in CasADi's form, as a function of input, an unused output and direction."""
+        """The directional derivative in CasADi's form: a function of the input, an unused output, and the direction."""
         if self._forward is None:
             raise NotImplementedError(name)
         x, unused, direction = (ca.MX.sym(letter, self._rows[0]) for letter in "xyd")
@@ -421,11 +428,11 @@ class ArrayNode(DenseNode):
         return ca.Function(name, [x, unused, direction], outputs, list(inames), list(onames), dict(opts))
 
     def has_jac_sparsity(self, oind: int, iind: int) -> bool:
-        """Whether the sparsity of the Jacobian is known without building the Jacobian."""
+        """Whether `get_jac_sparsity` gives the sparsity of the Jacobian: with a directional derivative."""
         return self._forward is not None
 
     def get_jac_sparsity(self, oind: int, iind: int, symmetric: bool) -> ca.Sparsity:
-        """An empty pattern, because a Krylov method uses only products with the Jacobian."""
+        """An empty sparsity pattern, because a Krylov method uses only products with the Jacobian."""
         return ca.Sparsity(self._outputs[oind][0], self._rows[iind])
 
     def reraise(self) -> None:

@@ -24,14 +24,15 @@ from orthocas.solvers.protocol import (
 from orthocas.tools.checks import Array, as_number, require_at_least, require_count, require_positive
 from orthocas.tools.progress import UNWATCHED, Watch
 
-_STATUS = {0: Status.CONVERGED, 1: Status.ITERATION_LIMIT}  # of SciPy
+_STATUS = {0: Status.CONVERGED, 1: Status.ITERATION_LIMIT}  # by the status of SciPy
 
 
 @dataclass(frozen=True)
 class GaussNewton:
-    """Levenberg-Marquardt: (H + mu diag H) step = -gradient; mu falls after a good step and rises after a bad one.
+    """Levenberg-Marquardt: steps (H + mu diag H) step = -gradient with the Gauss-Newton matrix H.
 
-    The loss does not depend on the scale of each coordinate. Damping takes care of these flat directions.
+    The damping mu falls after a good step and rises after a bad one. It also regularises H, which is singular because
+    the loss does not depend on the scale of each coordinate.
 
     Args:
         max_iterations: largest number of accepted steps.
@@ -65,6 +66,7 @@ class GaussNewton:
         return best.run(lambda: self._descend(best, objective))
 
     def _descend(self, best: BestPoint, objective: LeastSquaresObjective) -> Status:
+        """Take damped steps until the loss falls no more; return how it ended."""
         damping, gained_little = 1e-3, False
         while best.iterations < self.max_iterations:
             before, gradient, H = objective.normal_equations(best.theta)
@@ -75,7 +77,7 @@ class GaussNewton:
             next_damping = _step_down(best, gradient, H, damping)
             if next_damping is None:
                 return Status.STALLED if np.any(gradient) else Status.CONVERGED
-            # a step after rejections is short: a small gain is no convergence
+            # a small gain after rejected steps is no sign of convergence, because the step was short
             little = next_damping <= damping and before - best.value <= self.tolerance * before
             damping = next_damping
             converged, gained_little = little and gained_little, little
@@ -86,8 +88,12 @@ class GaussNewton:
 
 
 def _step_down(best: BestPoint, gradient: Array, H: Array, damping: float) -> float | None:
-    """Try steps with growing damping until the loss falls; returns the damping of the next step, or None."""
-    # Levenberg and Marquardt: damping in proportion to the diagonal
+    """Try steps with growing damping until the loss falls, and keep that point in `best`.
+
+    Returns:
+        The damping for the next step; None if no step lowers the loss.
+    """
+    # the damping is proportional to the diagonal of H (Marquardt)
     diagonal = H.diagonal()
     scale = np.maximum(diagonal, 1e-3 * diagonal.mean())
     for _ in range(RULES.most_rejections):
@@ -96,12 +102,12 @@ def _step_down(best: BestPoint, gradient: Array, H: Array, damping: float) -> fl
         try:
             try:
                 step = scipy.linalg.cho_solve(scipy.linalg.cho_factor(damped), gradient)
-            except np.linalg.LinAlgError:  # rounding in single precision has left it indefinite
+            except np.linalg.LinAlgError:  # rounding in single precision may have made the matrix indefinite
                 step = np.linalg.solve(damped, gradient)
         except np.linalg.LinAlgError:
             damping *= 10
             continue
-        # less damping after a success, more after a failure
+        # a fifth of the damping after a success, four times as much after a failure
         candidate = best.theta - np.asarray(step, dtype=float)
         best.evaluations += 1
         if best.offer(candidate, best.objective.value(candidate)):
@@ -140,6 +146,7 @@ class LBFGS:
         return best.run(lambda: self._descend(best))
 
     def _descend(self, best: BestPoint) -> Status:
+        """Minimise from the point in `best`; return how it ended."""
         value, gradient = best.value_and_gradient(best.theta)
         if not (np.isfinite(value) and np.isfinite(gradient).all()):
             return Status.FAILED
@@ -159,7 +166,7 @@ class LBFGS:
         iterations: int,
         tolerance: float,
     ) -> Status:
-        """SciPy's method; `count` sees each iterate, and may end it by StopIteration."""
+        """Run SciPy's L-BFGS-B. `count` is called after each iteration, and may end the run by StopIteration."""
         options = {"maxiter": iterations, "maxfun": np.inf, "maxcor": self.memory, "ftol": tolerance, "gtol": 0.0}
         end = scipy.optimize.minimize(
             value_and_gradient, start, method="L-BFGS-B", jac=True, callback=count, options=options
@@ -169,18 +176,19 @@ class LBFGS:
 
 @dataclass(frozen=True)
 class QuasiNewton(LBFGS):
-    """L-BFGS in variables z in which a Gauss-Newton matrix H, estimated from few samples and damped, is the identity.
+    """L-BFGS, preconditioned by a damped Gauss-Newton matrix H that is estimated from a part of the samples.
 
-    theta = theta_k + L^-T z with L L^T = H(theta_k) + 0.003 diag H. With many coefficients, only the diagonal blocks of
-    H are used. A matrix of K coefficients and N samples takes N K^2 operations, a gradient N K. So one matrix and many
-    gradients cost less than a few Gauss-Newton steps, and L-BFGS learns what the matrix misses. It starts again, with a
-    new matrix, once the loss has fallen enough.
+    The variables are z with theta = theta_k + L^-T z and L L^T = H(theta_k) + 0.003 diag H, so that the matrix is the
+    identity in z. With many coefficients, only the diagonal blocks of H are used. For K coefficients and N samples, a
+    matrix takes N K^2 operations, and a gradient N K. So one matrix and many gradients cost less than a few
+    Gauss-Newton steps, and L-BFGS learns what the matrix misses. It restarts with a new matrix once the loss has fallen
+    below `renewal` times its value at the last matrix.
 
     Args:
         max_iterations: largest number of iterations.
         tolerance: stop when two iterations in a row reduce the loss by less than this fraction each.
         memory: number of stored correction pairs.
-        renewal: fraction of the loss at the last matrix below which a new one is worth its time.
+        renewal: fraction of the loss at the last matrix below which a new matrix is computed.
 
     Source:
         ours; L-BFGS as in [NW2006] Alg. 7.5.
@@ -195,7 +203,7 @@ class QuasiNewton(LBFGS):
     def __post_init__(self) -> None:
         super().__post_init__()
         if not 0 <= as_number("renewal", self.renewal) < 1:
-            raise InvalidValueError("renewal", self.renewal, "a number from 0 to below 1")
+            raise InvalidValueError("renewal", self.renewal, "a number >= 0 and < 1")
 
     def coarser(self) -> QuasiNewton:
         """The same solver with at most 15 iterations, which stops when two steps gain less than 0.5 % each."""
@@ -217,23 +225,28 @@ class QuasiNewton(LBFGS):
         return super().minimise(objective, theta0, watch)
 
     def _descend(self, best: BestPoint) -> Status:
+        """Minimise with one matrix after the other; return how it ended."""
         while True:
             value, gradient = best.value_and_gradient(best.theta)
             if not (np.isfinite(value) and np.isfinite(gradient).all()):
                 return Status.FAILED
             if not gradient.any():
                 return Status.CONVERGED
-            # a new matrix whenever the old one does not serve any more
+            # compute a new matrix whenever the last one is out of date
             status = self._descend_with_matrix(best, gradient)
             if status is not None:
                 return status
 
     def _descend_with_matrix(self, best: BestPoint, gradient: Array) -> Status | None:
-        """Minimise in the variables z of the matrix at the best point; None where that is out of date."""
+        """Minimise in the variables z of the matrix at the best point.
+
+        Returns:
+            How it ended; None if the loss has fallen so far that a new matrix is worth its time.
+        """
         assert isinstance(best.objective, EstimatedObjective)
         start, height, loss = best.theta, best.value, _Finite(best, gradient)
         factors = [_factor(block) for block in best.objective.curvature_estimate(start)]
-        # SciPy's first step has length 1: in these units it is the Gauss-Newton step
+        # SciPy's first step has length 1. Scale z so that this is the Gauss-Newton step.
         unit = np.linalg.norm(_solve(factors, gradient))
         factors = [factor / unit for factor in factors]
         value, gained_little, converged = height, False, False
@@ -261,13 +274,15 @@ class QuasiNewton(LBFGS):
 
 
 class _Finite:
-    """The objective where it is finite; elsewhere L = L_k + |g_k (theta - theta_k)|, a rise above the last iterate.
+    """The objective, with finite values everywhere, for SciPy.
 
-    SciPy's line search gives up at NaN, and takes infinity for convergence. From the rise it turns back.
+    Where L is not finite, it is replaced by L_k + |g_k . (theta - theta_k)|, with the value L_k and the gradient g_k at
+    the last iterate theta_k. SciPy's line search would give up at NaN and take infinity for convergence; from this rise
+    it turns back.
 
     Args:
-        best: counts evaluations, and holds theta_0 with its finite value.
-        gradient: g_0.
+        best: evaluates the objective; holds theta_0 with its finite value.
+        gradient: the gradient g_0 at theta_0.
     """
 
     def __init__(self, best: BestPoint, gradient: Array) -> None:
@@ -284,13 +299,15 @@ class _Finite:
         return lower + abs(float(slope @ (theta - start))), np.zeros_like(theta)
 
     def next_iterate(self) -> float:
-        """Take the last point as the next iterate; returns its value."""
+        """Make the last finite point the next iterate theta_k; return its value."""
         self._iterate = self._last
         return self._last[1]
 
 
 def _factor(H: Array) -> Array:
-    """Cholesky factor L of a damped matrix. Rounding in single precision may ask for more damping.
+    """Cholesky factor L of a block H (K, K) with damping.
+
+    The damping grows until the matrix is positive definite, which rounding in single precision may require.
 
     Raises:
         SolveError: if the matrix is not finite.
@@ -299,10 +316,10 @@ def _factor(H: Array) -> Array:
     scale = np.maximum(diagonal, 1e-3 * diagonal.mean())
     damping = RULES.damping
     while True:
-        # until the matrix is positive definite
+        # try again with more damping until the matrix is positive definite
         damped = H + np.diag(damping * scale)
         if not np.isfinite(damped).all():
-            raise SolveError("the curvature of the loss is not finite: parameters are huge")
+            raise SolveError("the Gauss-Newton matrix of the loss is not finite: the parameters are too large")
         try:
             return np.asarray(np.linalg.cholesky(damped))
         except np.linalg.LinAlgError:
@@ -310,21 +327,21 @@ def _factor(H: Array) -> Array:
 
 
 def _solve(factors: Sequence[Array], vector: Array, transposed: bool = False) -> Array:
-    """L^-1 v, or L^-T v, of a matrix L with these blocks on its diagonal."""
+    """L^-1 v, or L^-T v if `transposed`, for a vector v (size,) and the diagonal blocks `factors` of L."""
     ends = np.cumsum([len(factor) for factor in factors])
     parts = zip(factors, np.split(vector, ends[:-1]), strict=True)
-    # numbers that are not finite are for the loss to report
+    # no check for finite numbers here, because the loss reports them
     solve = partial(scipy.linalg.solve_triangular, trans=int(transposed), lower=True, check_finite=False)
     return np.concatenate([solve(factor, part) for factor, part in parts], dtype=float)
 
 
 @dataclass(frozen=True)
 class Adam:
-    """Adam [KB2015]: steps along the mean gradient divided by the root of its mean square, with new samples each time.
+    """Adam [KB2015]: steps along the mean gradient divided by the root of the mean squared gradient.
 
-    After every epoch, the loss on the fixed samples is evaluated and the best point so far is kept. The learning rate
-    falls to zero along half a cosine, which makes the last epochs the best ones. Objectives without samples are used as
-    a whole.
+    Each step draws fresh samples; objectives without samples are used as a whole. After every epoch, the loss on the
+    fixed samples is evaluated, and the best point so far is kept. The learning rate falls to zero along half a cosine,
+    so that the last epochs are usually the best ones.
 
     Args:
         epochs: number of epochs; 200 in the paper.
@@ -354,12 +371,13 @@ class Adam:
         return best.run(lambda: self._descend(best))
 
     def _descend(self, best: BestPoint) -> Status:
+        """Run the epochs; return how it ended."""
         objective, theta = best.objective, np.array(best.theta)
         mean, square = np.zeros_like(theta), np.zeros_like(theta)
         if not np.isfinite(best.evaluate(theta)):
             return Status.FAILED
         while best.iterations < self.epochs:
-            # the steps of an epoch: on batches of samples in turn, or on the whole objective
+            # the objective of each step of an epoch: a batch of samples, or the whole
             parts: Iterable[Objective] = repeat(objective, self.steps)
             if isinstance(objective, SampledObjective):
                 parts = objective.batches(self.batch, self.steps, (best.iterations,))
@@ -369,7 +387,7 @@ class Adam:
                 if not np.isfinite(gradient).all():
                     return Status.STALLED
                 rate = self.learning_rate * 0.5 * (1 + np.cos(np.pi * k / (self.epochs * self.steps)))
-                # in parts that stay in the cache
+                # update theta in parts that stay in the cache
                 for start in range(0, len(gradient), RULES.part):
                     own = slice(start, start + RULES.part)
                     mean[own] += (1 - RULES.moment) * (gradient[own] - mean[own])

@@ -1,4 +1,4 @@
-"""The interface of solvers: objectives, results, and the best point so far, which Ctrl-C does not lose."""
+"""The interface of solvers: objectives, results, and the best point so far, which is kept after Ctrl-C."""
 
 import time
 from collections.abc import Callable, Iterator
@@ -18,26 +18,26 @@ from orthocas.tools.progress import UNWATCHED, Watch
 class SolverRules:
     """Numbers of the solvers."""
 
-    moment: float = 0.9  #: decay of Adam's mean gradient [KB2015]
-    square: float = 0.999  #: decay of its mean square
-    small: float = 1e-8  #: added to the root of it
-    part: int = 2**14  #: parameters that Adam moves at a time, which stay in the cache
-    most_rejections: int = 16  #: of a Gauss-Newton step: the damping may grow from its least to 400
-    damping: float = 3e-3  #: of the matrix of QuasiNewton, relative to its diagonal
-    exact_hessian: int = 1500  #: largest number of parameters for exact, dense Hessians in Ipopt
-    barrier: float = 1e-4  #: of Ipopt: starts are good, a stronger one would push away from them into worse minima
-    feasible: float = 1e-6  #: constraint violations up to this size count as zero
-    difference: float = 1e-7  #: step of finite differences of the gradient flow, relative to theta
-    first_interval: float = 1e-3  #: of the flow's time, in units of |theta0| / |grad L|
-    moved: float = 0.03  #: relative change of theta after which a Jacobian of the flow is out of date
-    most_uses: int = 10  #: of a Jacobian, so that Newton's method gets a new one where it does not converge
+    moment: float = 0.9  #: Adam: decay of the mean gradient [KB2015]
+    square: float = 0.999  #: Adam: decay of the mean squared gradient
+    small: float = 1e-8  #: Adam: added to the root of the mean square
+    part: int = 2**14  #: Adam: number of parameters updated at a time, so that they stay in the cache
+    most_rejections: int = 16  #: GaussNewton: largest number of rejected steps; damping grows from 1e-7 up to 400
+    damping: float = 3e-3  #: QuasiNewton: damping of the matrix, relative to its diagonal
+    exact_hessian: int = 1500  #: Ipopt: largest number of parameters for exact, dense Hessians
+    barrier: float = 1e-4  #: Ipopt: first barrier parameter; a larger one would push good starts away to worse minima
+    feasible: float = 1e-6  #: Ipopt: constraint violations up to this size count as zero
+    difference: float = 1e-7  #: GradientFlow: step of finite differences, relative to theta
+    first_interval: float = 1e-3  #: GradientFlow: length of the first interval, in units of |theta0| / |grad L|
+    moved: float = 0.03  #: GradientFlow: relative change of theta after which a Jacobian is out of date
+    most_uses: int = 10  #: GradientFlow: largest number of uses of a Jacobian; a new one may restore convergence
 
 
 RULES = SolverRules()
 
 
 class Objective(Protocol):
-    """A smooth function of theta."""
+    """A smooth function L(theta) to minimise, theta (size,)."""
 
     def value(self, theta: Array) -> float:
         """L(theta)."""
@@ -50,7 +50,7 @@ class Objective(Protocol):
 
 @runtime_checkable
 class LeastSquaresObjective(Objective, Protocol):
-    """A mean of squared residuals with a Gauss-Newton matrix."""
+    """A mean of squared residuals that provides its Gauss-Newton matrix."""
 
     def normal_equations(self, theta: Array) -> tuple[float, Array, Array]:
         """L(theta), its gradient (size,) and the Gauss-Newton matrix (size, size)."""
@@ -59,16 +59,19 @@ class LeastSquaresObjective(Objective, Protocol):
 
 @runtime_checkable
 class EstimatedObjective(Objective, Protocol):
-    """A mean of squared residuals with a rough Gauss-Newton matrix, which costs less than the one of all samples."""
+    """A mean of squared residuals that provides an estimate of its Gauss-Newton matrix, from a part of the samples."""
 
     def curvature_estimate(self, theta: Array) -> list[Array]:
-        """An estimate of the Gauss-Newton matrix: its diagonal blocks, in the order of theta, or the whole as one."""
+        """Estimate of the Gauss-Newton matrix as a list of its diagonal blocks in the order of theta.
+
+        If the list has one block, it is the whole matrix (size, size).
+        """
         ...
 
 
 @runtime_checkable
 class SmoothObjective(Objective, Protocol):
-    """An objective with its exact Hessian."""
+    """An objective that provides its exact Hessian."""
 
     def hessian(self, theta: Array) -> Array:
         """d^2L/dtheta^2, (size, size)."""
@@ -77,10 +80,10 @@ class SmoothObjective(Objective, Protocol):
 
 @runtime_checkable
 class SampledObjective(Objective, Protocol):
-    """A mean over samples that can draw fresh ones."""
+    """A mean over samples that can draw fresh samples."""
 
     def batches(self, size: int, count: int, seed: tuple[int, ...]) -> Iterator[Objective]:
-        """`count` objectives with the same mean over fresh samples, at most `size` each."""
+        """Yield `count` objectives, each the mean over at most `size` fresh samples."""
         ...
 
 
@@ -125,10 +128,10 @@ class SolveResult:
     seconds: float
 
     def require_finished(self) -> "SolveResult":
-        """The result, for callers that cannot use an unfinished one: raises KeyboardInterrupt if Ctrl-C ended it.
+        """Return the result, for callers that cannot use an interrupted one.
 
         Raises:
-            KeyboardInterrupt: after Ctrl-C.
+            KeyboardInterrupt: if Ctrl-C ended the minimisation.
             SolveError: if no usable point was found.
         """
         if self.status is Status.INTERRUPTED:
@@ -136,7 +139,10 @@ class SolveResult:
         return self.raise_if_failed()
 
     def raise_if_failed(self) -> "SolveResult":
-        """Raise SolveError if no usable point was found. A point found at the limit or at Ctrl-C is usable."""
+        """Return the result, or raise SolveError if no usable point was found.
+
+        The best point at the iteration limit or at Ctrl-C is usable.
+        """
         if self.status in (Status.FAILED, Status.INFEASIBLE):
             raise SolveError(
                 f"the minimiser ended after {self.iterations} iterations at loss {self.value:.6g}: {self.status.value}"
@@ -146,7 +152,7 @@ class SolveResult:
 
 @runtime_checkable
 class Solver(Protocol):
-    """A minimiser."""
+    """A minimiser with its settings."""
 
     @property
     def name(self) -> str:
@@ -154,14 +160,11 @@ class Solver(Protocol):
         ...
 
     def coarser(self) -> "Solver":
-        """The same solver with looser settings, for all stages of a continuation but the last."""
+        """The same solver with looser settings, for the stages of a continuation before the last one."""
         ...
 
     def minimise(self, objective: Objective, theta0: Array, watch: Watch = UNWATCHED) -> SolveResult:
-        """Minimise from theta0.
-
-        After Ctrl-C it returns the best point so far, with status INTERRUPTED.
-        """
+        """Minimise from theta0; after Ctrl-C, return the best point so far with the status INTERRUPTED."""
         ...
 
 
@@ -171,7 +174,7 @@ class BestPoint:
     Args:
         objective: the function to minimise.
         theta0: start.
-        watch: called with progress.
+        watch: receives the progress after each iteration.
     """
 
     def __init__(self, objective: Objective, theta0: Array, watch: Watch) -> None:
@@ -183,38 +186,42 @@ class BestPoint:
 
     @property
     def found(self) -> bool:
-        """Whether there is a point with a finite value."""
+        """Whether a point with a finite value was found."""
         return bool(np.isfinite(self.value))
 
     def offer(self, theta: Array, value: float) -> bool:
-        """Take a point if it is better; returns whether it was."""
+        """Keep a point if its value is the lowest so far; return whether it is."""
         better = value < self.value
         if better:
             self.theta, self.value = np.array(theta), float(value)
         return better
 
     def evaluate(self, theta: Array) -> float:
-        """Evaluate the objective alone, and take the point if it is better; returns the value."""
+        """Return L(theta), and keep the point if its value is the lowest so far."""
         value = self.objective.value(theta)
         self.evaluations += 1
         self.offer(theta, value)
         return value
 
     def value_and_gradient(self, theta: Array) -> tuple[float, Array]:
-        """Evaluate the objective, and take the point if it is better."""
+        """Return L(theta) and its gradient (size,), and keep the point if its value is the lowest so far."""
         value, gradient = self.objective.value_and_gradient(theta)
         self.evaluations += 1
         self.offer(theta, value)
         return value, gradient
 
     def next_iteration(self, limit: int) -> None:
-        """Count an iteration, of at most `limit`, and report it to the monitor."""
+        """Count an iteration, and report the share of `limit` and the best value to the watch."""
         check_remembered()
         self.iterations += 1
         self.watch.report(self.iterations / limit, self.value)
 
     def run(self, iterate: Callable[[], Status]) -> SolveResult:
-        """Iterate to the end. After Ctrl-C the result is the best point so far, if there is one."""
+        """Run a minimisation to its end and return the result; after Ctrl-C, that of the best point so far.
+
+        Raises:
+            KeyboardInterrupt: after Ctrl-C if there is no point with a finite value yet.
+        """
         try:
             status = iterate()
         except KeyboardInterrupt:
@@ -224,7 +231,7 @@ class BestPoint:
         return self.result(status)
 
     def result(self, status: Status) -> SolveResult:
-        """The result. Its status is FAILED if no point (that satisfies the constraints) has a finite value."""
+        """The result with a status; FAILED or INFEASIBLE if no point with a finite value was kept."""
         if not self.found and status is not Status.INFEASIBLE:
             status = Status.FAILED
         seconds = time.perf_counter() - self._start
