@@ -53,7 +53,7 @@ class Subdivision:
             raise InvalidValueError(
                 "codes", int(codes[inner].max()), f"indices of joints below {n}, {PROVED} or {OPEN}"
             )
-        # In preorder, each halved box adds two boxes to come. None must be missing at the end, and some before it.
+        # Number of boxes still to come after each code: a halved box adds two. It must be 0 at the end only.
         missing = 1 + np.cumsum(np.where(inner, 1, -1))
         if missing[-1] != 0 or (missing[:-1] <= 0).any():
             raise InvalidValueError("codes", f"{codes.size} bytes", "a complete tree, with two halves per inner box")
@@ -169,9 +169,10 @@ class Certificate(Shown):
         return replace(self, digest=self._compute_digest())
 
     def remove_given_up(self, count: int) -> Self:
-        """Seal a certificate of an older file again, whose digest included the number of parts that were given up.
+        """Replace the digest of a certificate from an older file, which included a number of given-up parts.
 
-        No check covers that number. If the digest does not match, the certificate stays, and `require_for` refuses it.
+        The new digest leaves this number out, because no check covers it. If the old digest does not match, the
+        certificate stays unchanged, and `require_for` refuses it.
         """
         return self.seal() if self.digest == self._compute_digest(count) else self
 

@@ -282,7 +282,7 @@ class Chart(Shown):
         # all solutions for one phi
         if all:
             if q_start is not None or inside:
-                raise InvalidValueError("all", "given with q_start or inside", "all alone")
+                raise InvalidValueError("all", "given with q_start or inside", "neither of them")
             return solve_all(self, as_point("phi", phi, self.n), tolerance, collisions)
         # one solution for each row; solutions in collision are replaced by free ones
         found = solve_rows(self, self.parts.inverse, phi, q_start, tolerance, inside)

@@ -65,7 +65,7 @@ def certificate_from_data(data: Mapping[str, Any], arrays: Mapping[str, Stored],
     injective = _tree(arrays, "injective", n) if "certificate_injective_codes" in arrays else None
     fold = get_part(data, "fold", list)
     if len(fold) not in (0, 2) or any(not isinstance(point, list) or len(point) != n for point in fold):
-        raise InvalidValueError("fold of a certificate", repr(fold)[:80], f"no or two joint positions of {n} numbers")
+        raise InvalidValueError("fold of a certificate", repr(fold)[:80], f"0 or 2 joint positions of {n} numbers")
     # Older files lack some numbers; they get the defaults.
     known = Certificate(
         get_part(data, "fingerprint", str),

@@ -356,7 +356,7 @@ class Coordinates:
 
 
 def _columns(values: Sequence[float] | Array, columns: int) -> ca.DM:
-    """The column of values, repeated."""
+    """Values as a column that is repeated `columns` times."""
     return ca.DM(np.repeat(np.asarray(values, dtype=float)[:, None], columns, axis=1))
 
 

@@ -328,7 +328,7 @@ class SelfMotionCurves:
         # where xi turns back between two steps
         bends = steps.follows.copy()
         bends[1:] &= ~(ahead[1:] * ahead[:-1] > 0) & both[1:] & both[:-1]
-        # also the first and last step of a curve: xi may turn back at its end, where no neighbour shows it
+        # The first and last step of a curve count, too: without a neighbour, a turn of xi at its end goes unnoticed.
         after = np.append(steps.follows[1:], False)
         changes |= bends | (both & ~(steps.follows & after))
         # add neighbours, because a root or turning point may lie just beyond the shared end
