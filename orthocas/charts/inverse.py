@@ -566,7 +566,7 @@ class Inverse:
         """Search once from starts (N, n) with a local solver, and evaluate the status of each row."""
         attempt = (local or self.local)(targets, starts)
         # move joints that miss the boundary by rounding onto it, if the point then still is a solution
-        low, high = self._bounds
+        low, high = self.problem.domain.bounds
         moved = np.clip(attempt.q, low, high)
         off = np.abs(moved - attempt.q)
         if off.any():
@@ -597,8 +597,3 @@ class Inverse:
     def _m(self) -> int:
         """Number of task components."""
         return self.problem.m
-
-    @cached_property
-    def _bounds(self) -> tuple[Array, Array]:
-        """Lowest and highest joint positions of the domain, (n,) each."""
-        return self.problem.domain.bounds

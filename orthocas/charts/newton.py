@@ -181,7 +181,7 @@ class _Run:
         self.stale = np.zeros(N, dtype=bool)  #: rows that need a new J
         # rows whose J was evaluated at the present q
         self._fresh = np.zeros(N, dtype=bool)
-        self._inverse = np.full((N, n, n), np.nan)  # of J / scale
+        self._inverse = np.full((N, n, n), np.nan)  # inverses of J / scale
         self._condition = np.full(N, np.inf)
 
     def refresh(self, rows: Indices) -> None:
