@@ -333,26 +333,19 @@ class Coordinates:
     @cached_property
     def _on_blocks(self) -> BuiltOnUse[str, Maker] | None:
         """Makers of xi and jacobian on blocks of joint positions; None if the family has no matrix products."""
-        if self.as_matrices:
-            return BuiltOnUse(lambda name: self._column_graphs[name].build_block_function)
-        if not len(self.offset) or not isinstance(family := self.family, SelfDerivativeFamily):
-            return None
-        return BuiltOnUse(lambda name: (_values if name == "xi" else _slopes)(self, family))
-
-    @cached_property
-    def _column_graphs(self) -> dict[str, NumpyGraph]:
-        """Graphs of xi and vec(J_xi^T) for many joint positions as columns (n, COLUMNS), for networks."""
-        q = ca.MX.sym("q", self.space.n, COLUMNS)
-        # gradients of all coordinates: r matrices (n, N)
-        N = q.shape[1]
-        unit = np.eye(self.space.n)
-        gradients: list[ca.MX] = []
-        if len(self.offset):
-            own = self.family.jacobian(q[self.active, :], ca.MX(ca.DM(self.theta)))
-            spread = ca.DM(unit[:, self.active])
-            gradients += [spread @ gradient * scale for gradient, scale in zip(own, self.scale, strict=True)]
-        J_xi = ca.vertcat(*gradients, *(ca.MX(_columns(unit[k], N)) for k in self.idle))
-        return {"xi": NumpyGraph("xi", [q], [self.expression(q)]), "jacobian": NumpyGraph("J_xi", [q], [J_xi])}
+        if not self.as_matrices:
+            if not len(self.offset) or not isinstance(family := self.family, SelfDerivativeFamily):
+                return None
+            return BuiltOnUse(lambda name: (_values if name == "xi" else _slopes)(self, family))
+        # networks: graphs of xi and vec(J_xi^T) for joint positions as columns (n, COLUMNS)
+        q, unit = ca.MX.sym("q", self.space.n, COLUMNS), np.eye(self.space.n)
+        # the gradient of each fitted coordinate, (n, COLUMNS), spread from the active joints to all; then idle joints
+        own = self.family.jacobian(q[self.active, :], ca.MX(ca.DM(self.theta)))
+        spread = ca.DM(unit[:, self.active])
+        gradients = [spread @ gradient * scale for gradient, scale in zip(own, self.scale, strict=True)]
+        J_xi = ca.vertcat(*gradients, *(ca.MX(_columns(unit[k], COLUMNS)) for k in self.idle))
+        graphs = {"xi": NumpyGraph("xi", [q], [self.expression(q)]), "jacobian": NumpyGraph("J_xi", [q], [J_xi])}
+        return BuiltOnUse(lambda name: graphs[name].build_block_function)
 
 
 def _columns(values: Sequence[float] | Array, columns: int) -> ca.DM:

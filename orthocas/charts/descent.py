@@ -337,21 +337,15 @@ def rooms_of(domain: Domain, q: ca.MX) -> ca.MX:
     clear = domain.singular_bound
     if clear is None:
         return ca.MX(0, 1) if domain.condition is None else domain.condition.pivots(q)
-    rooms = _clearance(clear.gram(q), clear.least_singular_value)
-    return rooms if domain.room_to_fold is None else ca.vertcat(rooms, domain.room_to_fold(q))
-
-
-def _clearance(gram: ca.MX, bound: float) -> ca.MX:
-    """Product over i of (1 - bound^2 / sigma_i^2), where sigma_i^2 are the eigenvalues of the Gram matrix (m, m).
-
-    It is 0 where the least singular value equals the bound. Computed as det(G - bound^2 I) / det G by pivots.
-    """
+    # The product of 1 - bound^2 / sigma_i^2 over the singular values is 0 where the least of them equals the bound. It
+    # is det(G - bound^2 I) / det G with the Gram matrix G of the task Jacobian's scaled rows, computed by pivots.
+    gram, bound = clear.gram(q), clear.least_singular_value
     m = gram.shape[0]
-    symbol = ca.SX.sym("G", m, m)
-    share = ca.SX(1)
-    for pivot, whole in zip(_pivots(symbol - bound**2 * ca.SX.eye(m)), _pivots(symbol), strict=True):
-        share *= pivot / whole
-    return ca.Function("clearance", [symbol], [ca.cse(share)])(gram)
+    G, clearance = ca.SX.sym("G", m, m), ca.SX(1)
+    for pivot, whole in zip(_pivots(G - bound**2 * ca.SX.eye(m)), _pivots(G), strict=True):
+        clearance *= pivot / whole
+    rooms = ca.Function("clearance", [G], [ca.cse(clearance)])(gram)
+    return rooms if domain.room_to_fold is None else ca.vertcat(rooms, domain.room_to_fold(q))
 
 
 def _pivots(A: ca.SX) -> list[ca.SX]:

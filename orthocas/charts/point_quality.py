@@ -517,8 +517,8 @@ def _function(m: int, n: int, euclidean: bool) -> tuple[ColumnFunction, dict[str
 def _formulas(task: ca.SX, covectors: ca.SX, inverse: ca.SX | None, at: ca.SX) -> dict[str, ca.SX]:
     """Expressions of the results of `judge` by name, from rows of J_x (m, n) and J_xi (r, n), and A^-1 (None: I).
 
-    In place of the conditioning, they have the smallest eigenvalue of the Gram matrix, its square, and the last
-    Laguerre step towards it from `at`.
+    In place of the conditioning, they include its square, which is the smallest eigenvalue of a Gram matrix, and the
+    last Laguerre step towards that eigenvalue from `at`.
     """
     m, r = task.size1(), covectors.size1()
     raised, gradients = (rows if inverse is None else rows @ inverse for rows in (task, covectors))
