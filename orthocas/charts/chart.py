@@ -78,7 +78,7 @@ class Chart(Shown):
         methods = [getattr(type(self.coordinates), name, None) for name in ("xi", "jacobian", "size")]
         if None in methods:
             kind = type(self.coordinates).__name__
-            raise InvalidValueError("coordinates", f"a {kind}", "an object with the methods of a CoordinateMap")
+            raise InvalidValueError("coordinates", f"a {kind}", "a CoordinateMap, with `xi`, `jacobian` and `size`")
         require_kind("notes", self.notes, Mapping)
         object.__setattr__(self, "notes", MappingProxyType(dict(self.notes)))
         if self.certificate is not None:
