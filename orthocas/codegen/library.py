@@ -351,6 +351,7 @@ def _build_state(
     if has_spring:
         layout |= dict.fromkeys(("load", "drive", "speed"), joints) | {"inertia": number * n**2}
         layout |= dict.fromkeys(("expected", "unexplained", "momentum", "trend", "touch", "carried"), joints)
+        layout |= dict.fromkeys(("apart", "gone", "same_q", "same_dq"), joints)
     # The memory of a law precedes the last reference.
     if memory._fields_:
         layout["memory"] = memory

@@ -184,7 +184,8 @@ def test_from_outside_of_a_corridor_the_arm_goes_to_the_nearest_part_of_the_path
     in_corridor: tuple[PDPlus, CompiledLibrary], beyond: list[float]
 ) -> None:
     law, library = in_corridor
-    supervisor, q, still = Supervisor(library, law), PATH.mean(axis=0) + beyond, np.zeros(3)
+    supervisor = Supervisor(library, law, Safety.of(law, return_speed=0.02))
+    q, still = PATH.mean(axis=0) + beyond, np.zeros(3)
     assert not law.problem.domain.contains(q)
     supervisor.start(q)
     assert supervisor.step(q, still, at_rest(law.chart, q), TICK)[1] is ControlStatus.CAUGHT
@@ -193,7 +194,7 @@ def test_from_outside_of_a_corridor_the_arm_goes_to_the_nearest_part_of_the_path
     np.testing.assert_allclose(supervisor.safe, [q[0], *goal[1:]], atol=1e-4)
     supervisor.resume()
     statuses = []
-    while len(statuses) < 4000 and ControlStatus.OK not in statuses:  # an arm that is always where the anchor is
+    while len(statuses) < 20000 and ControlStatus.OK not in statuses:  # an arm that is always where the anchor is
         statuses.append(supervisor.step(supervisor.anchor, still, at_rest(law.chart, q), TICK)[1])
     assert set(statuses) == {ControlStatus.RETURNING, ControlStatus.OK}
     assert from_path(supervisor.q)[0] < 0.9

@@ -166,6 +166,61 @@ def test_sensors_that_freeze_in_motion_and_report_no_speed_do_not_make_the_arm_f
     assert found[1e3][1] > 10
 
 
+@pytest.mark.parametrize(("which", "most"), [("positions", 1.0), ("speeds", 6.0), ("no speeds", 2.5), ("both", 1.0)])
+def test_positions_that_freeze_alone_and_speeds_that_do_are_found(
+    supervised_library: CompiledLibrary, supervised_law: Controller, planar_for_control: oc.Chart, which: str, most: float
+) -> None:
+    """Of one joint, while the others go on. What is left of it damps the arm, which comes to rest.
+
+    Speeds that freeze make a law push before they are found. Where both freeze, the model is right for some tenths of a second.
+    """
+    chart, q, joint = planar_for_control, planar_for_control.problem.domain.centre, 1
+    dq = np.array([0.3, -0.3, 0.3])
+    arm, supervisor = Arm(chart.problem.robot, q, dq), Supervisor(supervised_library, supervised_law)
+    supervisor.take_over(q, chart.problem.robot.gravity(q))
+    statuses, fastest = [], 0.0
+    for k in range(400 if which == "both" else 1500):
+        place, speed = arm.q.copy(), arm.dq.copy()
+        if k == 100:
+            frozen = place[joint]
+        if k >= 100 and which in ("positions", "both"):
+            place[joint] = frozen
+        if k >= 100 and which != "positions":
+            speed[joint] = 0.0 if which == "no speeds" else dq[joint]
+        # Speeds that freeze show as the reference goes back.
+        back = k > 150 and which == "speeds"
+        wanted = moving(chart, q + TICK * (300 - k if back else k) * dq, -dq if back else dq)
+        command, status = supervisor.step(place, speed, wanted if k < 400 else at_rest(chart, q), TICK)
+        arm.move(command)
+        statuses.append(status)
+        fastest = max(fastest, np.abs(arm.dq).max())
+    assert 100 < statuses.index(ControlStatus.BAD_INPUT) < 300
+    assert supervisor.mode == 1
+    assert supervisor.cause == ControlStatus.BAD_INPUT
+    assert fastest < most
+    assert np.abs(arm.dq).max() < 0.1
+
+
+@pytest.mark.parametrize("lag", [0.0, 0.01])
+def test_slow_sensors_and_speeds_that_lag_are_not_taken_for_frozen_ones(
+    supervised_library: CompiledLibrary, supervised_law: Controller, planar_for_control: oc.Chart, lag: float
+) -> None:
+    """Encoders of 12 bits, read at 100 Hz, and speeds that a filter delays and rounds; a swing of 1 rad/s."""
+    chart, q, count = planar_for_control, planar_for_control.problem.domain.centre, 2 * np.pi / 2**12
+    safety = Safety.of(supervised_law, stale_ticks=20)
+    supervisor = Supervisor(supervised_library, supervised_law, safety)
+    supervisor.take_over(q, chart.problem.robot.gravity(q))
+    slow, way = np.zeros(3), 0.1 * np.array([1.0, -1.0, 1.0])
+    for k in range(1000):
+        phase = 10 * TICK * k
+        place, speed = q + way * (1 - np.cos(phase)), 10 * way * np.sin(phase)
+        slow += (speed - slow) * (TICK / lag if lag else 1.0)
+        if k % 10 == 0:
+            seen = count * np.round(place / count), np.round(slow, 3)
+        _, status = supervisor.step(*seen, moving(chart, place, speed), TICK)
+        assert status is not ControlStatus.BAD_INPUT, k
+
+
 def test_an_arm_that_friction_stops_measures_the_same_without_a_fault(
     supervised_library: CompiledLibrary, supervised_law: Controller, planar_for_control: oc.Chart
 ) -> None:
@@ -190,8 +245,9 @@ def test_a_measurement_now_and_then_is_enough(supervisor: Supervisor, planar_for
     chart, q = planar_for_control, planar_for_control.problem.domain.centre
     settled(supervisor, chart, q)
     for k in range(1000):
-        dq = np.array([0.1, 0.0, 1e-3 * (k // 5)])
-        assert supervisor.step(q, dq, at_rest(chart, q), TICK)[1] is not ControlStatus.BAD_INPUT
+        time, dq = TICK * 5 * (k // 5), np.array([0.1, 0.0, 1e-4 * (k // 5)])
+        place = q + time * dq * np.array([1.0, 1.0, 0.5])
+        assert supervisor.step(place, dq, moving(chart, place, dq), TICK)[1] is not ControlStatus.BAD_INPUT
 
 
 @pytest.mark.slow

@@ -1,9 +1,8 @@
 /* orthocas_runtime.c: chart, inverse map, and the law under supervision, for any robot and law.
  *
  * Read it from top to bottom: constants; numbers; chart and dynamics; inverse map; the supervised law: its modes as a
- * table, boundary, sensors, modes in code, references, catcher, memory, one tick; references of programs. R1 to R36 are
+ * table, boundary, sensors, modes in code, references, catcher, memory, one tick; references of programs. R1 to R37 are
  * requirements; docs/reference/runtime.md says which tests check which.
- *
  * C99, no global variables, no heap, no input, no output. Every array has the size that orthocas_runtime.h says; local
  * arrays are places in `work`, which a caller owns.
  */
@@ -18,19 +17,14 @@
 
 /* Constants. What depends on the number type is in orthocas_numbers, what depends on the robot in orthocas_safety. */
 static const struct {
-  int halvings;
-#ifndef ORTHOCAS_CHART_ONLY
   double turn, longest, implausible, jitter, alike, stirring, slowest, standing, room, nearly, slow, settling, giving;
-  double growing, forgetting, learning, lifted, touching, far_off, deep, hasty, stopping, trend, contact;
-  int forever, bisections, sweeps;
-#endif
+  double growing, forgetting, fading, learning, lifted, touching, far_off, deep, hasty, stopping, trend, contact;
+  int halvings, forever, bisections, sweeps;
 } rules = {
-  .halvings = 20, /* of a step of the inverse map: 2^-20 of it is below what moves an arm */
-#ifndef ORTHOCAS_CHART_ONLY
   .turn = 6.283185307179586, /* of a joint [rad] */
   .longest = 1e6,            /* period that is not a number any more [s] */
   .implausible = 30.0,       /* times the speed limit: a bad measurement, as no arm is so fast */
-  .jitter = 0.01,            /* of positions between two ticks, by encoders and their noise [rad] or [m] */
+  .jitter = 0.01,            /* of positions, by encoders and their noise [rad] or [m] */
   .alike = 0.2,              /* share by which a motion may differ from that of the measured speeds */
   .stirring = 1e-3,          /* of the rest speed: slower joints may stand, as simulated ones do with a dq of 1e-18 */
   .slowest = 0.04,           /* of the rest speed: an arm so slow is held by its command */
@@ -42,6 +36,7 @@ static const struct {
   .giving = 0.02,            /* share of the spring or load that a fast arm takes away in a tick */
   .growing = 0.25,           /* share of what torques can do by which speeds grow that sensors must go on to show */
   .forgetting = 0.1,         /* share of a loss of speed that counts though no torque explains it, as by blows, walls */
+  .fading = 5.0,             /* rate at which it is forgotten how far joints went [1/s] */
   .learning = 2.0,           /* rate at which the load is learned, slower than the catcher's modes [1/s] */
   .lifted = 0.5,             /* largest load, in limits of the command: the other half is for motion */
   .touching = 60.0,          /* rate at which contacts are felt, faster than loads are learned [1/s] */
@@ -51,10 +46,10 @@ static const struct {
   .stopping = 0.1,           /* time constant with which a reference comes to rest that does not go on [s] */
   .trend = 200.0,            /* rate of the filter of speeds that shows accelerations [1/s] */
   .contact = 0.2,            /* distance of links that counts as 1 [m]: catch_margin to return_margin are 2 to 20 mm */
+  .halvings = 20,            /* of a step of the inverse map: 2^-20 of it is below what moves an arm */
   .forever = 1000000,        /* ticks; a counter stops there, before it overflows */
   .bisections = 10,          /* of the way of a stream to the boundary: 1e-3 of it */
   .sweeps = 6,               /* of rotations for an eigenvalue; they converge quadratically */
-#endif
 };
 
 /* ---- numbers ---- */
@@ -69,10 +64,7 @@ static int all_finite(const orthocas_arm *arm, const double *x, int count) {
   return all_from(-arm->numbers.largest, x, count, arm->numbers.largest);
 }
 
-static void set_zero(double *x, int count) {
-  for (int i = 0; i < count; ++i) x[i] = 0.0;
-}
-
+static void set_zero(double *x, int count) { memset(x, 0, (size_t)count * sizeof *x); }
 static void copy(double *to, const double *from, int count) { memcpy(to, from, (size_t)count * sizeof *to); }
 
 static double dot(const double *x, const double *y, int count) {
@@ -87,17 +79,9 @@ static void multiply(const double *A, const double *x, double *y, int n) {
 }
 
 /* The next numbers of `work`. */
-static double *take(double **work, int count) {
-  double *place = *work;
-  *work += count;
-  return place;
-}
+static double *take(double **work, int count) { return (*work += count) - count; }
 
-static void swap(double *x, double *y) {
-  const double kept = *x;
-  *x = *y;
-  *y = kept;
-}
+static void swap(double *x, double *y) { const double kept = *x; *x = *y; *y = kept; }
 
 /* Solve A x = b for `count` columns b by elimination with pivoting; x replaces b. Returns 0 if A is singular. */
 static int solve(const orthocas_arm *arm, double *A, double *b, int size, int count) {
@@ -121,15 +105,6 @@ static int solve(const orthocas_arm *arm, double *A, double *b, int size, int co
       x[i] /= A[i * size + i];
     }
   return 1;
-}
-
-/* Largest difference, relative to the largest number; infinite for numbers that are not finite. */
-ORTHOCAS_API double orthocas_difference(const orthocas_arm *arm, const double *found, const double *wanted, int count) {
-  double largest = arm->numbers.smallest, worst = 0.0;
-  if (!all_finite(arm, found, count)) return INFINITY;
-  for (int i = 0; i < count; ++i) largest = fmax(largest, fabs(wanted[i]));
-  for (int i = 0; i < count; ++i) worst = fmax(worst, fabs(found[i] - wanted[i]) / largest);
-  return worst;
 }
 
 /* ---- chart and dynamics (R1: outputs are finite, whatever the inputs are) ---- */
@@ -453,7 +428,6 @@ ORTHOCAS_API int orthocas_control(const orthocas_arm *arm, const double *q, cons
 }
 
 /* ---- the law under supervision ----
- *
  * | mode    | who commands             | goes to | when                                                                |
  * | ------- | ------------------------ | ------- | ------------------------------------------------------------------- |
  * | LAW     | the law, faded in        | CATCHER | it does not work here; the boundary is near or will be in fade_out; |
@@ -464,7 +438,6 @@ ORTHOCAS_API int orthocas_control(const orthocas_arm *arm, const double *q, cons
  * |         | moving inside            | CATCHER | a joint is too fast; hold_ticks without measurement                 |
  * | HOLD    | the fallback: brakes     | CATCHER | release                                                             |
  * | all     |                          | HOLD    | hold                                                                |
- *
  * Room: the distance to the boundary in half-widths of the domain. `cause` says why the catcher took over last.
  */
 
@@ -476,7 +449,6 @@ static void divide_by_inertia(const orthocas_arm *arm, const double *M, double *
 }
 
 static double clipped(double x, double bound) { return fmin(fmax(x, -bound), bound); }
-
 static int is_position(const orthocas_arm *arm, const double *q) {
   return all_from(-arm->numbers.farthest, q, arm->n, arm->numbers.farthest);
 }
@@ -488,12 +460,7 @@ static double between(const orthocas_arm *arm, int i, double difference) {
 
 static orthocas_reference take_places(const orthocas_arm *arm, double **work) {
   double *first = take(work, 3 * arm->k);
-  orthocas_reference places = {first, first + arm->k, first + 2 * arm->k};
-  return places;
-}
-
-static int is_finite(const orthocas_arm *arm, const orthocas_reference *reference) {
-  return all_finite(arm, reference->value, 3 * arm->k);
+  return (orthocas_reference){first, first + arm->k, first + 2 * arm->k};
 }
 
 /* What the robot executes now, if it is given. */
@@ -632,18 +599,9 @@ static double unturned(const orthocas_arm *arm, const orthocas_state *state, int
 }
 
 static int faster_than(const orthocas_arm *arm, const double *dq, const double *speed, double share) {
-  int fast = 0;
-  for (int i = 0; i < arm->n; ++i) fast = fast || fabs(dq[i]) > share * speed[i];
-  return fast;
-}
-
-/* Whether the joints moved as the speeds say since the last finite measurement: then even great speeds are true. */
-static int moved_as_told(const orthocas_arm *arm, const orthocas_state *state, const double *q, const double *dq) {
-  for (int i = 0; i < arm->n; ++i) {
-    const double told = 0.5 * (dq[i] + state->seen_dq[i]) * state->unseen;
-    if (!(fabs(between(arm, i, q[i] - state->seen_q[i]) - told) <= rules.jitter + rules.alike * fabs(told))) return 0;
-  }
-  return 1;
+  for (int i = 0; i < arm->n; ++i)
+    if (fabs(dq[i]) > share * speed[i]) return 1;
+  return 0;
 }
 
 /* A count of ticks after one more, or its milliseconds if there are several: slower programs wait no longer. */
@@ -654,23 +612,25 @@ static int later(int ticks, double period) {
 /* The time of a tick and of so many before it. */
 static double lasted(int ticks, double period) { return period * (1.0 + (double)ticks / (double)later(0, period)); }
 
-/* R7: a measurement can be true if it is finite, not absurdly fast, and near the last good one, if that is not old. */
+/* R7: a measurement can be true if it is finite, not absurdly fast, and near the last good one, if that is not old. Or
+ * if joints moved as their speeds say since the last finite one: then even great speeds are true. */
 static int plausible(const orthocas_arm *arm, const orthocas_state *state, const double *q, const double *dq,
                      double period) {
   const orthocas_safety *safety = state->safety;
   const int recent = state->bad_ticks < safety->hold_ticks || state->bad_ticks <= later(0, period);
-  int odd = faster_than(arm, dq, safety->speed_limit, rules.implausible);
-  for (int i = 0; i < arm->n && recent; ++i)
-    odd = odd || fabs(between(arm, i, unturned(arm, state, i, q[i]) - state->q[i])) >
-                     rules.implausible * safety->speed_limit[i] * lasted(state->bad_ticks, period) + rules.jitter;
-  return !odd || moved_as_told(arm, state, q, dq);
+  int agree = 1, odd = faster_than(arm, dq, safety->speed_limit, rules.implausible);
+  for (int i = 0; i < arm->n; ++i) {
+    const double far = rules.implausible * safety->speed_limit[i] * lasted(state->bad_ticks, period) + rules.jitter;
+    const double told = 0.5 * (dq[i] + state->seen_dq[i]) * state->unseen, slack = rules.jitter + rules.alike * fabs(told);
+    odd = odd || (recent && fabs(between(arm, i, unturned(arm, state, i, q[i]) - state->q[i])) > far);
+    agree = agree && fabs(between(arm, i, q[i] - state->seen_q[i]) - told) <= slack;
+  }
+  return !odd || agree;
 }
 
 /* Whether dq is what the robot measures: an observer makes it from counts, whose differences are rough. */
 static int measures_speeds(const orthocas_arm *arm, const orthocas_state *state) {
-  int measured = arm->torque;
-  for (int i = 0; i < arm->n && measured; ++i) measured = !(state->safety->observer_rate[i] > 0.0);
-  return measured;
+  return arm->torque && all_from(0.0, state->safety->observer_rate, arm->n, 0.0);
 }
 
 /* R36: the share, at most 1, of a change of speeds (n,) that friction and the last command can bring in a time t. */
@@ -709,6 +669,42 @@ static int frozen(const orthocas_arm *arm, const orthocas_state *state, const do
   return faster_than(arm, dq, safety->rest_speed, rules.stirring) || faster_than(arm, speed, safety->stuck_speed, 1.0);
 }
 
+/* How far joint i went of late, how much of it its speeds do not tell, and for how long either was the same. */
+static void count_ways(const orthocas_arm *arm, orthocas_state *state, int i, double q, double dq, int good) {
+  const double time = state->unseen, way = between(arm, i, q - state->seen_q[i]);
+  const double told = 0.5 * (dq + state->seen_dq[i]) * time;
+  const int moved = fabs(way) > 0.0, back = moved && !(state->same_q[i] < rules.longest);
+  const int anew = !good || back || state->bad_ticks > 0 || state->fresh || state->mode == ORTHOCAS_HOLD;
+  const double left = anew ? 0.0 : fmax(0.0, 1.0 - rules.fading * time);
+  state->apart[i] = left * (state->apart[i] + way - told);
+  state->gone[i] = left * (state->gone[i] + 0.5 * (fabs(way) + fabs(told)));
+  state->same_q[i] = anew || moved ? 0.0 : state->same_q[i] + time;
+  state->same_dq[i] = anew || fabs(dq - state->seen_dq[i]) > 0.0 ? 0.0 : state->same_dq[i] + time;
+  if (back) state->anchor[i] = unturned(arm, state, i, q);
+}
+
+/* R37: where positions of a joint do not go as far as its speeds tell, a sensor of it froze. What lives replaces what
+ * froze, until that changes: speeds, or positions; where both froze, the model foresees them. Returns whether any did. */
+static int use_rest(const orthocas_arm *arm, orthocas_state *state, double *q, double *dq, double period) {
+  const double wait = (double)state->safety->stale_ticks * period;
+  int frozen = 0;
+  for (int i = 0; i < arm->n; ++i) {
+    double *same_q = state->same_q + i, *same_dq = state->same_dq + i, same = fmin(*same_q, *same_dq);
+    const double slack = rules.jitter + rules.alike * state->gone[i];
+    const int stale = same > wait && fabs(dq[i]) * fmin(same, 1.0 / rules.fading) > 0.5 * rules.jitter; /* both are */
+    const int known = fmax(*same_q, *same_dq) >= rules.longest || fabs(state->apart[i]) > slack;
+    if (state->safety->observer_rate[i] > 0.0 || !(stale || known)) continue;
+    frozen = 1;
+    if (stale || (*same_q >= *same_dq && fabs(dq[i]) * *same_q > rules.jitter)) *same_q = rules.longest;
+    else if (*same_dq > wait) *same_dq = rules.longest;
+    const double faster = between(arm, i, q[i] - state->q[i]) / period - state->dq[i];
+    if (*same_q < rules.longest) dq[i] = state->dq[i] + fmin(rules.touching * period, 1.0) * faster;
+    else if (same > 0.0) dq[i] = state->dq[i] + period * state->expected[i];
+    if (*same_q >= rules.longest) q[i] = state->q[i] + period * dq[i];
+  }
+  return frozen;
+}
+
 /* Look at a measurement. Returns 1 if it can be used, -1 if it stands still while the arm is as fast as it was. */
 static int look(const orthocas_arm *arm, orthocas_state *state, const double *q, const double *dq, double period,
                 double *work) {
@@ -718,6 +714,8 @@ static int look(const orthocas_arm *arm, orthocas_state *state, const double *q,
   good = plausible(arm, state, q, dq, period);
   for (int i = 0; i < n; ++i)
     if (fabs(q[i] - state->seen_q[i]) > 0.0 || fabs(dq[i] - state->seen_dq[i]) > 0.0) same = 0;
+  for (int i = 0; i < n && arm->torque; ++i)
+    count_ways(arm, state, i, q[i], dq[i], good && period <= state->safety->longest_period);
   if (!same && good) set_zero(state->impulse, n);
   if (!same && good && arm->torque) {
     carry(arm, state, dq, period, work);
@@ -753,8 +751,8 @@ static void watch_sensors(const orthocas_arm *arm, orthocas_state *state, const 
 
 /* R9: the catcher takes over, and says why. Its spring starts with the force that it had, so nothing jumps. */
 static void catch_arm(const orthocas_arm *arm, orthocas_state *state, int cause) {
-  const double *q = state->q;
-  for (int i = 0; i < arm->n; ++i) state->anchor[i] = q[i] - state->brake * between(arm, i, q[i] - state->anchor[i]);
+  for (int i = 0; i < arm->n; ++i)
+    state->anchor[i] = state->q[i] - state->brake * between(arm, i, state->q[i] - state->anchor[i]);
   state->mode = ORTHOCAS_CATCHER;
   state->cause = cause;
   state->asked = 0;
@@ -789,8 +787,7 @@ static int gives_way(const orthocas_state *state) {
 }
 
 /* R35: whether joints are faster than limits, or on the way there: they accelerate on, half as much on average, until
- * the torque that drives them is taken back, which takes time by command_rate. That is what commands have put in and
- * nothing that is felt balances: an arm that presses against a wall, or rebounds from a blow, is not driven by that. */
+ * the torque that drives them is taken back at command_rate. What a wall or the rebound of a blow balances drives none. */
 static int hurries(const orthocas_arm *arm, orthocas_state *state, double period) {
   const orthocas_safety *safety = state->safety;
   const double *dq = state->dq, rate = fmin(rules.trend, 1.0 / period);
@@ -868,7 +865,7 @@ static int take_reference(const orthocas_arm *arm, orthocas_state *state, const 
                           const orthocas_reference *reference, double period, double *measured, double *error,
                           double *change, double *work) {
   const orthocas_safety *safety = state->safety;
-  const int k = arm->k, bad = !is_finite(arm, reference);
+  const int k = arm->k, bad = !all_finite(arm, reference->value, 3 * arm->k);
   double *rate = take(&work, k), *bend = take(&work, k);
   int moves = 0, stands = 1;
   if (!bad) {
@@ -1038,11 +1035,10 @@ static void brake_at(const orthocas_arm *arm, orthocas_state *state, const doubl
 
 /* R19: acceleration by spring and damper near the limits of joint i. */
 static double stop_at(const orthocas_safety *safety, int i, double q, double dq) {
-  const double above = q - (safety->upper[i] - safety->stop_zone[i]);
-  const double below = (safety->lower[i] + safety->stop_zone[i]) - q;
-  if (above > 0.0) return -safety->stop_stiffness[i] * above - safety->stop_damping[i] * fmax(dq, 0.0);
-  if (below > 0.0) return safety->stop_stiffness[i] * below - safety->stop_damping[i] * fmin(dq, 0.0);
-  return 0.0;
+  const double above = fmax(q - (safety->upper[i] - safety->stop_zone[i]), 0.0);
+  const double below = fmin(q - (safety->lower[i] + safety->stop_zone[i]), 0.0);
+  const double towards = above > 0.0 ? fmax(dq, 0.0) : below < 0.0 ? fmin(dq, 0.0) : 0.0;
+  return -safety->stop_stiffness[i] * (above > 0.0 ? above : below) - safety->stop_damping[i] * towards;
 }
 
 /* R20: learn the load, the torque that holds the arm beside the fallback: what the momentum gained in a period (0: not
@@ -1136,22 +1132,23 @@ static void observe(const orthocas_arm *arm, orthocas_state *state, double *q, d
     const double rate = state->safety->observer_rate[i], gap = between(arm, i, q[i] - state->q[i]);
     const double error = gap - clipped(gap, 0.5 * state->safety->encoder_step[i]);
     const double left = exp(-rate * period), taken = 1.0 - left;
-    if (!observes(state) || !(rate > 0.0) || !(fabs(gap) <= rules.far_off)) {
-      state->unexplained[i] = 0.0;
-      continue;
+    if (!observes(state) || !(rate > 0.0) || !(fabs(gap) <= rules.far_off)) state->unexplained[i] = 0.0;
+    else {
+      q[i] -= gap - (1.0 - left * left * left) * error;
+      dq[i] = state->dq[i] + 1.5 * taken * taken * (1.0 + left) / period * error;
+      state->unexplained[i] += taken * taken * taken / (period * period) * error;
     }
-    q[i] -= gap - (1.0 - left * left * left) * error;
-    dq[i] = state->dq[i] + 1.5 * taken * taken * (1.0 + left) / period * error;
-    state->unexplained[i] += taken * taken * taken / (period * period) * error;
   }
 }
 
 /* What it expects of a command: M ddq = command - fallback - C dq, since the fallback holds an arm at rest. */
 static void expect(const orthocas_arm *arm, orthocas_state *state, const double *command, const double *fallback,
-                   const double *M, const double *bias, const double *gravity, double *work) {
+                   const double *M, const double *bias, const double *gravity, int frozen, double *work) {
+  const int measured = measures_speeds(arm, state);
   for (int i = 0; i < arm->n; ++i) state->drive[i] = command[i] - fallback[i] - (bias[i] - gravity[i]);
-  if (measures_speeds(arm, state) || state->mode == ORTHOCAS_HOLD) return;
-  copy(state->expected, state->drive, arm->n);
+  set_zero(state->expected, arm->n);
+  if ((measured && !frozen) || state->mode == ORTHOCAS_HOLD) return;
+  for (int i = 0; i < arm->n; ++i) state->expected[i] = state->drive[i] - (measured ? state->load[i] : 0.0);
   divide_by_inertia(arm, M, state->expected, work);
   for (int i = 0; i < arm->n; ++i) state->expected[i] += state->unexplained[i];
 }
@@ -1312,7 +1309,7 @@ ORTHOCAS_API int orthocas_step(const orthocas_arm *arm, orthocas_state *state, i
   double *speed = take(&work, n), *M = take(&work, n * n), *bias = take(&work, n), *gravity = take(&work, n);
   double clear, room, gap;
   const orthocas_reference shifted = take_places(arm, &work);
-  int seen, good, cut, lost, known, status, limited = 1;
+  int seen, good, cut, lost, known, status, frozen, limited = 1;
   /* A limit that is not > 0 is not used; the last one holds (R5). */
   for (int i = 0; i < n; ++i) limited = limited && gains->given_limit[i] > 0.0;
   for (int i = 0; i < k; ++i) set = set && safety->integral_rate[i] <= arm->integral_bound; /* R17 */
@@ -1329,9 +1326,10 @@ ORTHOCAS_API int orthocas_step(const orthocas_arm *arm, orthocas_state *state, i
   for (int i = 0; i < n; ++i) here[i] = unturned(arm, state, i, q[i]);
   copy(speed, dq, n);
   if (arm->torque) observe(arm, state, here, speed, since);
+  frozen = arm->torque && use_rest(arm, state, here, speed, since);
   lost = state->bad_ticks >= safety->hold_ticks && state->bad_ticks > later(0, since); /* not after one slow tick */
   gap = lasted(state->bad_ticks, since); /* with ticks that kept the command */
-  if (state->fresh || lost || late || state->mode == ORTHOCAS_HOLD) gap = 0.0;
+  if (state->fresh || lost || late || frozen || state->mode == ORTHOCAS_HOLD) gap = 0.0;
   known = gap > 0.0 && state->bad_ticks == 0;
   state->bad_ticks = 0;
   copy(state->q, here, n);
@@ -1341,6 +1339,7 @@ ORTHOCAS_API int orthocas_step(const orthocas_arm *arm, orthocas_state *state, i
     copy(state->anchor, here, n);
     take_command(arm, state, 0);
   }
+  if (frozen && state->mode != ORTHOCAS_CATCHER) catch_arm(arm, state, ORTHOCAS_BAD_INPUT); /* not in HOLD */
   if (arm->torque && !known) copy(state->trend, speed, n); /* nobody saw how it got them */
   clear = clearance(arm, here, work);
   room = distance(arm, here, speed, 0.0, clear, work);
@@ -1353,7 +1352,7 @@ ORTHOCAS_API int orthocas_step(const orthocas_arm *arm, orthocas_state *state, i
   if (state->fresh) settle(arm, state, room, work);
   status = arm->kernels.control(shared, here, speed, &shifted, gains->used, law);
   fallback_at(arm, here, gains->used, fallback);
-  choose_mode(arm, state, status, clear, room, error, since, late, work);
+  choose_mode(arm, state, status, clear, room, error, since, late || frozen, work);
   for (int i = 0; i < n; ++i) { /* one that gives way gets what it had, but nothing that drives its joint on */
     if (gives_way(state) && before == ORTHOCAS_LAW) state->law[i] = state->command[i] - fallback[i];
     else if (works(status) && !gives_way(state)) state->law[i] = law[i] - fallback[i];
@@ -1366,10 +1365,11 @@ ORTHOCAS_API int orthocas_step(const orthocas_arm *arm, orthocas_state *state, i
   cut = cut_command(arm, state, since, command) || status == ORTHOCAS_SATURATED;
   copy(state->command, command, n);
   watch_sensors(arm, state, fallback, command, since);
-  if (arm->torque) expect(arm, state, command, fallback, M, bias, gravity, work);
+  if (arm->torque) expect(arm, state, command, fallback, M, bias, gravity, frozen, work);
   advance(arm, state, shared, error, cut, clear, room, since, work);
   if (arm->memory > 0) remember(arm, state, &shifted, gains, cut ? 0.0 : state->weight, known ? since : 0.0, work);
   /* R28: the status says what the program should do. */
+  if (frozen) return ORTHOCAS_BAD_INPUT;
   if (state->mode == ORTHOCAS_CATCHER || state->mode == ORTHOCAS_HOLD) return ORTHOCAS_CAUGHT;
   if (state->mode == ORTHOCAS_RETURN) return ORTHOCAS_RETURNING;
   if (!good || !set || !limited) return ORTHOCAS_BAD_INPUT;
@@ -1436,7 +1436,7 @@ ORTHOCAS_API int orthocas_reference_stream(const orthocas_arm *arm, const double
   const orthocas_reference next = take_places(arm, &work);
   double share = 1.0;
   int good, cut = 0;
-  if (!(omega > 0.0 && period >= 0.0) || !all_finite(arm, &omega, 1) || !is_finite(arm, reference))
+  if (!(omega > 0.0 && period >= 0.0) || !all_finite(arm, &omega, 1) || !all_finite(arm, reference->value, 3 * arm->k))
     return ORTHOCAS_NOT_FINITE;
   arm->kernels.gap(reference, target, goal, velocity, acceleration);
   good = all_finite(arm, target, k) && all_finite(arm, goal, k);
@@ -1456,7 +1456,7 @@ ORTHOCAS_API int orthocas_reference_stream(const orthocas_arm *arm, const double
   }
   /* Orientations turn instead of adding up. */
   if (arm->kernels.turned_by != 0) arm->kernels.turned_by(reference->value, way, velocity, acceleration, &next);
-  if (!is_finite(arm, &next)) return ORTHOCAS_NOT_FINITE;
+  if (!all_finite(arm, next.value, 3 * k)) return ORTHOCAS_NOT_FINITE;
   copy(reference->value, next.value, 3 * arm->k);
   if (!good) return ORTHOCAS_NOT_FINITE;
   return cut ? ORTHOCAS_NEAR_BOUNDARY : ORTHOCAS_OK;
@@ -1476,11 +1476,11 @@ ORTHOCAS_API int orthocas_reference_spline(const orthocas_arm *arm, const orthoc
     wanted.velocity[i] = (v + s * (a + s * (3.0 * c3 + s * (4.0 * c4 + s * 5.0 * c5)))) / T;
     wanted.acceleration[i] = (a + s * (6.0 * c3 + s * (12.0 * c4 + s * 20.0 * c5))) / (T * T);
   }
-  if (is_finite(arm, &wanted) && all_finite(arm, &duration, 1) && all_finite(arm, &time, 1)) {
+  if (all_finite(arm, wanted.value, 3 * arm->k) && all_finite(arm, &duration, 1) && all_finite(arm, &time, 1)) {
     copy(reference->value, wanted.value, 3 * arm->k);
     return ORTHOCAS_OK;
   }
-  if (!is_finite(arm, reference)) copy(reference->value, from->value, 3 * arm->k);
+  if (!all_finite(arm, reference->value, 3 * arm->k)) copy(reference->value, from->value, 3 * arm->k);
   set_zero(reference->velocity, 2 * arm->k);
   return ORTHOCAS_NOT_FINITE;
 }
@@ -1490,7 +1490,7 @@ ORTHOCAS_API double orthocas_reference_pace(const orthocas_arm *arm, const doubl
                                             const double *led, const orthocas_safety *safety,
                                             const orthocas_reference *reference, double period, double *work) {
   double *nothing = take(&work, arm->k), *speed = take(&work, arm->n), *shared = take(&work, arm->shared), pace;
-  if (!is_finite(arm, reference) || !(period > 0.0)) return 0.0;
+  if (!all_finite(arm, reference->value, 3 * arm->k) || !(period > 0.0)) return 0.0;
   set_zero(nothing, arm->k);
   arm->kernels.shared(q, dq, shared);
   pace = paced(arm, q, dq, led, safety, shared, reference, nothing, period, speed, work);

@@ -161,7 +161,7 @@ typedef struct {
   double weight, brake, unseen, hasty, energy;
   double *q, *dq, *seen_q, *seen_dq, *command, *led, *impulse, *impulse_from, *law, *anchor, *safe, *limit; /* (n,) */
   double *offset, *integral;                                                                                /* (k,) */
-  double *load, *drive, *speed, *expected, *unexplained, *momentum, *trend, *touch, *carried; /* (n,), null for velocity laws */
+  double *load, *drive, *speed, *expected, *unexplained, *momentum, *trend, *touch, *carried, *apart, *gone, *same_q, *same_dq; /* (n,), null for velocity laws */
   double *inertia;                                                           /* (n, n), null for velocity laws */
   double *memory;                                                            /* (memory,) or null */
   orthocas_reference reference;
@@ -197,7 +197,6 @@ ORTHOCAS_API int orthocas_inverse(const orthocas_arm *arm, const double *phi, co
                                   double *q, double *work);
 ORTHOCAS_API int orthocas_nearest(const orthocas_arm *arm, const double *phi, const double *q_start, double largest_step,
                                   double *q, double *work, int *held);
-ORTHOCAS_API double orthocas_difference(const orthocas_arm *arm, const double *found, const double *wanted, int count);
 
 #ifndef ORTHOCAS_CHART_ONLY
 /* The law without supervision: see NAME_control. */
