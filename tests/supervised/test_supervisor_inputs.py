@@ -168,11 +168,16 @@ def test_sensors_that_freeze_in_motion_and_report_no_speed_do_not_make_the_arm_f
 
 @pytest.mark.parametrize(("which", "most"), [("positions", 1.0), ("speeds", 6.0), ("no speeds", 2.5), ("both", 1.0)])
 def test_positions_that_freeze_alone_and_speeds_that_do_are_found(
-    supervised_library: CompiledLibrary, supervised_law: Controller, planar_for_control: oc.Chart, which: str, most: float
+    supervised_library: CompiledLibrary,
+    supervised_law: Controller,
+    planar_for_control: oc.Chart,
+    which: str,
+    most: float,
 ) -> None:
     """Of one joint, while the others go on. What is left of it damps the arm, which comes to rest.
 
-    Speeds that freeze make a law push before they are found. Where both freeze, the model is right for some tenths of a second.
+    Speeds that freeze make a law push before they are found. Where both freeze, the model is right for some tenths of a
+    second.
     """
     chart, q, joint = planar_for_control, planar_for_control.problem.domain.centre, 1
     dq = np.array([0.3, -0.3, 0.3])
