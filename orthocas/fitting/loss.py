@@ -72,7 +72,7 @@ def loss(
     else:
         points = as_point_set("samples", samples, problem.n)[0]
     drawn = evaluate_samples(problem, points)
-    # Parameters whose orientation counts: those that are given, or where a fit starts
+    # Parameters whose orientation the regularity term keeps: those that are given, or where a fit starts
     if start is not None:
         theta0 = freeze_array("start", start, (family.size,))
     elif isinstance(family, LinearFamily):
@@ -84,7 +84,7 @@ def loss(
     J = _build_jacobians(family, drawn.points, theta)
     gradients = ca.Function("J", [theta], [J])(theta0).full().T.reshape(len(drawn), -1, problem.r)
     orientation = drawn.orientation(gradients.transpose(0, 2, 1))
-    # The loss of one sample, for all of them side by side
+    # Map the loss of one sample over all samples
     sizes = Sizes(problem.n, problem.m, problem.r, drawn.metric_inverse is None)
     of_sample = Loss.of(sizes, Weights.of(weights).for_problem(problem).by_name)
     one, column = build_sample_loss(of_sample), ca.SX.sym("J", problem.r * problem.n)
@@ -92,7 +92,7 @@ def loss(
     shaped = [ca.reshape(part, *one.size_in(1 + k)) for k, part in enumerate(parts)]
     value = one(ca.reshape(column, problem.r, problem.n), *shaped)
     losses = ca.Function("losses", [column, *parts], [value]).map(len(drawn))
-    # Its mean, with the data of the samples as columns (entries, N), matrices column by column
+    # The mean loss. The data of the samples are columns (entries, N), with the entries of matrices column by column
     data = drawn.collect_data(of_sample.data, orientation)
     flat = [(part.transpose(0, 2, 1) if part.ndim == 3 else part).reshape(len(part), -1).T for part in data]
     mean = ca.sum2(losses(J, *map(ca.DM, flat))) / len(drawn)
@@ -100,9 +100,9 @@ def loss(
 
 
 def _build_jacobians(family: Family, points: Array, theta: ca.MX) -> ca.MX:
-    """J_xi of every sample column by column, (r n, N)."""
+    """J_xi of all samples, (r n, N): the entries of each matrix, column by column, are a column."""
     N, n = points.shape
-    # Bases are linear in theta: their gradients at the samples are numbers
+    # Bases are linear in theta: J_xi = C G with constant gradients G at the samples
     if isinstance(family, LinearFamily):
         q = ca.SX.sym("q", n)
         slopes = ca.Function("slopes", [q], [ca.densify(ca.jacobian(family.basis(q), q))])  # (K, n)
@@ -110,7 +110,7 @@ def _build_jacobians(family: Family, points: Array, theta: ca.MX) -> ca.MX:
         C = ca.reshape(theta, family.width, family.outputs).T
         linear: ca.MX = ca.reshape(C @ G, family.outputs * n, N)
         return linear
-    # Other families as they differentiate themselves
+    # Other families have a function for their derivatives
     place = ca.MX.sym("q", n, N)
     gradients = ca.Function("gradients", [place, theta], family.jacobian(place, theta))
     by_component: list[Any] = gradients.call([ca.MX(ca.DM(points.T)), theta])
