@@ -1096,7 +1096,7 @@ def test_bad_settings_are_named() -> None:
     with pytest.raises(InvalidValueError, match="clearance"):
         oc.fit_wide(known.robot, known.task, clearance=float("nan"))
     with pytest.raises(
-        InvalidValueError, match=r"parametrisation is linear.*, expected one that is fitted.* or one without"
+        InvalidValueError, match=r"parametrisation is linear.*, expected a family to fit.* or one without"
     ):
         oc.fit_wide(known.robot, known.task, BENT, parametrisation=oc.Linear())
     with pytest.raises(InvalidValueError, match=r"parametrisation is mlp:4x4, expected .* linear in .*, for like"):
