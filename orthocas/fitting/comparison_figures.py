@@ -174,7 +174,10 @@ def _label(axes: Axes, summaries: "Sequence[Summary]", single: bool, colours: Ma
         wide = _LETTER * len(name)
         side = 1 if x + _ASIDE + wide < end else -1
         left, right = sorted((x + side * _ASIDE, x + side * (_ASIDE + wide)))
-        height = _free_height(y, low, high, [box[2] for box in boxes if left < box[1] and box[0] < right])
+        taken = [box[2] for box in boxes if left < box[1] and box[0] < right]
+        nearest = (height for shift in range(round(high - low)) for height in (y + shift, y - shift))
+        free = (own for own in nearest if low <= own <= high and all(abs(own - other) >= _HIGH for other in taken))
+        height = next(free, y)
         boxes.append((left, right, height))
         axes.annotate(
             name,
@@ -187,15 +190,6 @@ def _label(axes: Axes, summaries: "Sequence[Summary]", single: bool, colours: Ma
             verticalalignment="center",
             arrowprops={"arrowstyle": "-", "color": colours[name], "linewidth": 0.7, "relpos": (side < 0, 0.5)},
         )
-
-
-def _free_height(y: float, low: float, high: float, taken: Sequence[float]) -> float:
-    """The height from low to high nearest to y that is free of taken heights [pt]; y if there is none."""
-    for shift in range(round(high - low)):
-        for height in (y + shift, y - shift):
-            if low <= height <= high and all(abs(height - other) >= _HIGH for other in taken):
-                return height
-    return y
 
 
 def _scale(axes: Axes, *values: Sequence[float]) -> None:

@@ -242,7 +242,17 @@ class Continuation:
         self, label: str, family: Family, samples: Samples, mirror: Mirror | None
     ) -> tuple[Objective, Array]:
         """The loss of a family on samples, and the start, in the parameters that are free."""
-        theta, settings = self._embed_last(family), self.settings
+        settings, theta = self.settings, None
+        if self._reached is not None:
+            # Start from the last result. A basis of higher degree contains the last one
+            theta, before = self._stages[-1].result.theta, self._reached[1]
+            if theta.size != family.size:
+                assert isinstance(family, GradedFamily)
+                assert isinstance(before, GradedFamily)
+                theta = family.embed(theta, before)
+        elif self.begin is not None and isinstance(settings.parametrisation, Polynomial) and self.mirror is None:
+            assert isinstance(family, ProductFamily)
+            theta = self.begin(family)
         # The loss of linear families is a least-squares problem in their coefficients
         if isinstance(family, LinearFamily):
             objective, start = self._build_in_basis(family, samples, theta, mirror)
@@ -264,22 +274,6 @@ class Continuation:
             label = settings.parametrisation.label
             raise InvalidValueError("precision", f"'single' with {label}", "double, or a basis or a network (mlp)")
         return self.folds.add_to(GraphObjective(family, samples, settings.weights, start, self._draw)), start
-
-    def _embed_last(self, family: Family) -> Array | None:
-        """The last result as parameters of a family, (size,). At first, those of `begin`; None without a start."""
-        if self._reached is None:
-            polynomials = isinstance(self.settings.parametrisation, Polynomial)
-            if self.begin is None or not polynomials or self.mirror is not None:
-                return None
-            assert isinstance(family, ProductFamily)
-            return self.begin(family)
-        # A basis of higher degree contains the last one
-        theta, before = self._stages[-1].result.theta, self._reached[1]
-        if theta.size == family.size:
-            return theta
-        assert isinstance(family, GradedFamily)
-        assert isinstance(before, GradedFamily)
-        return family.embed(theta, before)
 
     def _build_in_basis(
         self, family: LinearFamily, samples: Samples, theta: Array | None, mirror: Mirror | None
@@ -327,18 +321,17 @@ class Continuation:
             return mirror
         family = self._family(target.of_degree(min(target.degree, RULES.trial_degree)))
         assert isinstance(family, LinearFamily)
-        return min(mirror.list_choices(), key=lambda choice: self._try(family, choice))
-
-    def _try(self, family: LinearFamily, mirror: Mirror) -> float:
-        """The loss that a family reaches with these symmetric coordinates."""
-        samples = self._sample(self._count_samples(family, mirror.kept(family)), (self.settings.seed, 0))
-        with one_blas_thread():
-            with deferred():
-                objective, start = self._build_in_basis(family, samples, None, mirror)
-            result = GaussNewton().coarser().minimise(objective, start)
-        if result.status is Status.INTERRUPTED:
-            raise KeyboardInterrupt
-        return result.value
+        losses: list[tuple[float, Mirror]] = []
+        for choice in mirror.list_choices():
+            samples = self._sample(self._count_samples(family, choice.kept(family)), (self.settings.seed, 0))
+            with one_blas_thread():
+                with deferred():
+                    objective, start = self._build_in_basis(family, samples, None, choice)
+                result = GaussNewton().coarser().minimise(objective, start)
+            if result.status is Status.INTERRUPTED:
+                raise KeyboardInterrupt
+            losses.append((result.value, choice))
+        return min(losses, key=lambda pair: pair[0])[1]
 
     def _require_memory(self, target: GradedParametrisation) -> None:
         """Refuse a degree that needs more memory than there is, before anything large is built."""

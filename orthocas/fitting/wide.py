@@ -46,7 +46,7 @@ from orthocas.robots.robot import Robot
 from orthocas.robots.tree import require_driven
 from orthocas.solvers.protocol import Status
 from orthocas.tasks.branches import RULES as BRANCH_RULES
-from orthocas.tasks.branches import Branch, Branches, branches, build_clear_box, sample_centres, sample_nonsingular
+from orthocas.tasks.branches import Branch, branches, build_clear_box, sample_centres, sample_nonsingular
 from orthocas.tasks.domains import Box
 from orthocas.tasks.metric import Metric, MetricSpec
 from orthocas.tasks.problem import Problem, check
@@ -199,7 +199,14 @@ def fit_wide(
     solids = robot.collisions if collisions else None
 
     # The branch, the posture at which xi equals its quantity, and clear positions that measure the regular share
-    chosen = _choose_branch(robot, task, branch, home)
+    if isinstance(branch, Branch):
+        chosen = branch
+    elif isinstance(branch, Box):
+        chosen = Branch("box", branch, branch.centre, float("nan"), float("nan"))
+    else:
+        # Default: the branch of the home posture, or the largest one
+        parts = branches(robot, task)
+        chosen = parts[branch] if branch is not None else parts.of(find_home(robot, task, home).q) or parts[0]
     posture = chosen.posture if home is None else find_home(robot, task, home).q
     counted = sample_nonsingular(robot, task, chosen.box, RULES.held_out, (seed, RULES.counted_tag))
     counted = counted if solids is None else counted[solids.check_free(counted)]
@@ -239,18 +246,6 @@ def _check_weights(weights: Weights | Mapping[str, float]) -> Weights | Mapping[
     for name in weights:
         find_term(name)
     return Weights(extra=weights).extra
-
-
-def _choose_branch(robot: Robot, task: Task, branch: Branch | Box | str | None, home: ArrayLike | str | None) -> Branch:
-    """The branch that is given or named. Default: that of the home posture, or the largest one."""
-    if isinstance(branch, Branch):
-        return branch
-    if isinstance(branch, Box):
-        return Branch("box", branch, branch.centre, float("nan"), float("nan"))
-    parts: Branches = branches(robot, task)
-    if branch is not None:
-        return parts[branch]
-    return parts.of(find_home(robot, task, home).q) or parts[0]
 
 
 def _build_problems(

@@ -234,7 +234,12 @@ class Search:
             near = sample_uniform(Box(domain.home, RULES.near * domain.half_width), count, seed)
             self._samples = [sample_frames(problem, np.vstack([points, near[domain.contains(near)]]))]
             if problem.metric.is_identity or problem.r > 1 or self.left_out:
-                self._last = self._start_at_random()
+                # A random start; gradients are scaled to length 1 in the mean if the family permits that
+                self._last, some = self.family.initial(self.settings.seed), self._samples[0][:: RULES.every_of_networks]
+                if isinstance(self.family, CombinableFamily):
+                    J = self.coordinates(self._last).jacobian(some.points)
+                    lengths = np.sqrt(np.einsum("srn,srn->sr", J, some.compute_metric_gradients(J)).mean(axis=0))
+                    self._last = self.family.combined(self._last, np.diag(1 / lengths))
             else:
                 # Networks of all joints start from those of A = I: from a random start, some would stay folded
                 plain = Problem(problem.robot, problem.task, "euclidean", problem.domain, problem.name)
@@ -345,15 +350,6 @@ class Search:
             C[k] *= np.sqrt(a / (C[k] @ E @ C[k]))
         return np.asarray(C.ravel())
 
-    def _start_at_random(self) -> Array:
-        """Random parameters (size,); gradients are scaled to length 1 in the mean if the family permits that."""
-        start, some = self.family.initial(self.settings.seed), self._samples[0][:: RULES.every_of_networks]
-        if not isinstance(self.family, CombinableFamily):
-            return start
-        J = self.coordinates(start).jacobian(some.points)
-        lengths = np.sqrt(np.einsum("srn,srn->sr", J, some.compute_metric_gradients(J)).mean(axis=0))
-        return self.family.combined(start, np.diag(1 / lengths))
-
     def _add_worst(self, fresh: int, worst: int, tag: int) -> None:
         """Add the `worst` of `fresh` samples, at which the last coordinates have the least volumes."""
         points = self.sample(fresh, tag)
@@ -374,8 +370,18 @@ class Search:
                 result = solver.minimise(objective, start, Watch(self.settings.monitor, name))
                 self._last = objective.parameters(result.theta)
             else:
+                # The loss of any other family, on batches drawn from all samples so far
+                samples = join_samples(self._samples)
+                self._samples = [samples]
+                watched = np.arange(0, count, max(1, count // RULES.watched))
                 with deferred():
-                    resampled = self._build_resampled(self._choose_weights(volume))
+                    common = samples, self._choose_weights(volume), self._last, self._draw
+                    whole: ArrayObjective | GraphObjective
+                    if isinstance(self.family, ArrayFamily):
+                        whole = ArrayObjective(self.family, *common, single=True, orientation=self._sign)
+                    else:
+                        whole = GraphObjective(self.family, *common, orientation=self._sign)
+                    resampled = Resampled(whole, watched, count)
                 result = solver.minimise(resampled, self._last, Watch(self.settings.monitor, name))
                 self._last = result.theta
         return self._take(name, replace(result, theta=self._last), count)
@@ -430,18 +436,6 @@ class Search:
         if self._likeness:
             parts.append((1.0, Likenesses(self._likeness, lengths)))
         return Orthonormal(WeightedSum(parts), self._factor, lengths)
-
-    def _build_resampled(self, weights: Weights) -> Resampled:
-        """The loss of any other family, on batches drawn from all samples so far."""
-        samples = join_samples(self._samples)
-        self._samples = [samples]
-        whole: ArrayObjective | GraphObjective
-        common = samples, weights, self._last, self._draw
-        if isinstance(self.family, ArrayFamily):
-            whole = ArrayObjective(self.family, *common, single=True, orientation=self._sign)
-        else:
-            whole = GraphObjective(self.family, *common, orientation=self._sign)
-        return Resampled(whole, np.arange(0, len(samples), max(1, len(samples) // RULES.watched)), len(samples))
 
     def _draw(self, count: int, seed: tuple[int, ...]) -> Samples:
         points = sample_uniform(self.problem.domain, count, (self.settings.seed, RULES.tag, *seed))

@@ -36,7 +36,15 @@ def keep_library(kind: str, sources: Mapping[str, str], flags: Sequence[str], fo
         CompileError: if there is no C compiler, it fails, or the folder is not the user's own.
         InvalidValueError: if the folder cannot be written.
     """
-    compiler, options = _choose_compiler(), ("-std=c99", "-fPIC", "-shared", *flags)
+    # The compiler is one on the PATH, else that of the pip package ziglang.
+    compiler: tuple[str, ...]
+    try:
+        compiler = (find_compilers()[0],)
+    except CompileError:
+        if importlib.util.find_spec("ziglang") is None:
+            raise
+        compiler = (sys.executable, "-m", "ziglang", "cc")
+    options = ("-std=c99", "-fPIC", "-shared", *flags)
     content = [*(text.encode() for text in sources.values()), repr((compiler, options)).encode()]
     name = f"{kind}-{hashlib.sha256(b'/'.join(content)).hexdigest()[:32]}.so"
     place = _find_cache() if folder is None else as_path("folder", folder)
@@ -55,20 +63,6 @@ def keep_library(kind: str, sources: Mapping[str, str], flags: Sequence[str], fo
                 raise CompileError(f"{' '.join(compiler)} wrote no library, expected a C compiler")
             (drafts / f"{name}.sha256").write_text(compute_digest(drafts / name))
     return library
-
-
-def _choose_compiler() -> tuple[str, ...]:
-    """The command that compiles C: a compiler on the PATH, else that of the pip package ziglang.
-
-    Raises:
-        CompileError: if there is neither.
-    """
-    try:
-        return (find_compilers()[0],)
-    except CompileError:
-        if importlib.util.find_spec("ziglang") is None:
-            raise
-        return (sys.executable, "-m", "ziglang", "cc")
 
 
 def find_compilers() -> tuple[str, ...]:

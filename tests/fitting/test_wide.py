@@ -515,7 +515,9 @@ def test_a_tool_that_turns_alone_is_on_one_side_of_singular_positions() -> None:
     whole = oc.Box(domain.centre, domain.half_width)
     problem = oc.Problem(robot, fit.chart.problem.task, domain=whole, least_singular_value=0.1)
     searches = [Search(problem, oc.Polynomial(1), WideSettings(2, seed)) for seed in range(20)]
-    with pytest.raises(InvalidValueError, match="samples is 2, expected more samples: all lie beyond singular positions"):
+    with pytest.raises(
+        InvalidValueError, match="samples is 2, expected more samples: all lie beyond singular positions"
+    ):
         [search.sample(2, 0) for search in searches]
     q = np.vstack([domain.centre, sample_uniform(whole, 4000, 3)])
     moved = geometric_jacobians(robot, q)
