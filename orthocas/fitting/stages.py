@@ -457,7 +457,7 @@ class FitSettings:
         Raises:
             InvalidValueError, ShapeError: if a setting is invalid, or contradicts another one.
         """
-        # The family, for this problem
+        # Choose the family, and adapt it to the problem
         require_kind("problem", problem, Problem)
         if parametrisation is None:
             parametrisation = choose_parametrisation(problem, bounded=max_mutual_deg is not None)

@@ -92,7 +92,7 @@ def find_spectral_start(
 
 
 def _find_smallest(S: Array, T: Array, V: Array, free: NDArray[np.bool_]) -> Array:
-    """The c (K,) with c^T T c = 1 and the smallest c^T S c, zero where it is not free; among exact ones, by V.
+    """The c (K,) with c^T T c = 1 and the smallest c^T S c, and zeros where it is not free.
 
     If c^T S c is zero for several c, the one with the smallest c^T V c is taken.
     """

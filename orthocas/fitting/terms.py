@@ -377,24 +377,16 @@ def volume_hinges(units: UnitGradients, null_basis: Array, bound: float) -> tupl
     D = units.rows @ null_basis
     volume = np.linalg.det(D)
     hinges, cofactors = np.maximum(bound - volume, 0.0), np.zeros(D.shape)
-    # Cofactors are needed only where the hinge acts
-    active = np.flatnonzero(hinges > 0)
-    cofactors[active] = -_cofactors(D[active], volume[active])
-    return hinges, cofactors @ null_basis.transpose(0, 2, 1)
-
-
-def _cofactors(D: Array, volume: Array) -> Array:
-    """Cofactors of matrices (N, r, r) with these determinants: det D D^-T, or by singular values next to folds."""
-    folded = np.abs(volume) < RULES.nearly_folded
-    if not folded.any():
-        return volume[:, None, None] * np.linalg.inv(D).transpose(0, 2, 1)
-    cofactors = np.empty(D.shape)
-    cofactors[~folded] = volume[~folded, None, None] * np.linalg.inv(D[~folded]).transpose(0, 2, 1)
-    U, s, Vt = np.linalg.svd(D[folded])
-    sign = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
-    others = np.stack([np.delete(s, k, axis=1).prod(axis=1) for k in range(D.shape[1])], axis=1)
-    cofactors[folded] = sign[:, None, None] * (U * others[:, None, :]) @ Vt
-    return cofactors
+    # Where the hinge acts, the cofactors are det D D^-T; next to folds, singular values give them
+    near = np.abs(volume) < RULES.nearly_folded
+    regular, folded = np.flatnonzero((hinges > 0) & ~near), np.flatnonzero((hinges > 0) & near)
+    cofactors[regular] = volume[regular, None, None] * np.linalg.inv(D[regular]).transpose(0, 2, 1)
+    if len(folded):
+        U, s, Vt = np.linalg.svd(D[folded])
+        sign = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
+        others = np.stack([np.delete(s, k, axis=1).prod(axis=1) for k in range(D.shape[1])], axis=1)
+        cofactors[folded] = sign[:, None, None] * (U * others[:, None, :]) @ Vt
+    return hinges, -cofactors @ null_basis.transpose(0, 2, 1)
 
 
 @dataclass(frozen=True)

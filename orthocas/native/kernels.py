@@ -493,7 +493,8 @@ def _environment(package: str) -> Environment:
         autoescape=False,
     )
     environment.filters |= {"numbers": write_numbers, "array": lambda values: f"{{{write_numbers(values)}}}"}
-    environment.filters["strings"] = lambda words: f"{{{', '.join(map(_quote, words))}}}"
+    # C string literals have single quotes in place of double ones.
+    environment.filters["strings"] = lambda words: "{" + ", ".join('"' + w.replace('"', "'") + '"' for w in words) + "}"
 
     # Translate Python code for NumPy to the library that the template is for.
     def translate(context: Context, text: str) -> str:
@@ -501,11 +502,6 @@ def _environment(package: str) -> Environment:
 
     environment.filters["code"] = pass_context(translate)
     return environment
-
-
-def _quote(word: str) -> str:
-    """A C string literal, with single quotes in place of double quotes."""
-    return '"' + word.replace('"', "'") + '"'
 
 
 def write_numbers(values: Iterable[Any]) -> str:
