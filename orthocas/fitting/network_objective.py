@@ -26,7 +26,7 @@ from orthocas.tools.expressions import replay
 
 
 class _SampledLoss(ABC):
-    """Mean loss (25) of a family on fixed samples. Subclasses compute the coordinate gradients.
+    """Mean loss (25) of a family on fixed samples. Subclasses evaluate it.
 
     Args:
         family: the coordinates.
@@ -46,12 +46,11 @@ class _SampledLoss(ABC):
         # The orientation is that of the start at up to 200 of the samples
         if orientation is None and (self._loss.oriented or weights.folds > 0):
             some = samples[: RULES.orienting]
-            self._orientation = some.orientation(self._evaluate_jacobian(some.points, start))
+            q, theta = ca.MX.sym("q", n, len(some)), ca.MX.sym("theta", family.size)
+            graph = NumpyGraph("J_xi", [q, theta], [ca.vertcat(*family.jacobian(q, theta))])
+            (J,) = graph(np.ascontiguousarray(some.points), np.ascontiguousarray(start))
+            self._orientation = some.orientation(J.reshape(len(some), family.outputs, n))
         self._put(samples, len(samples))
-
-    @abstractmethod
-    def _evaluate_jacobian(self, points: Array, theta: Array) -> Array:
-        """J_xi at points (N, n), (N, r, n)."""
 
     @abstractmethod
     def _hold(self, points: Array, entries: Array, room: int) -> None:
@@ -157,9 +156,6 @@ class ArrayObjective(_SampledLoss):
         """Parameters in the number type of the products."""
         return theta.astype(np.float32 if self._single else np.float64)
 
-    def _evaluate_jacobian(self, points: Array, theta: Array) -> Array:
-        return self._family.pullback(points, theta)[0]
-
     def _hold(self, points: Array, entries: Array, room: int) -> None:
         self._arranged = list[_Piece]()
 
@@ -203,14 +199,6 @@ class GraphObjective(_SampledLoss):
         start = np.ascontiguousarray(theta)
         parts = [self._graph.both(start, *block) for block in self._blocks]
         return sum(float(value[0, 0]) for value, _ in parts), np.sum([slopes[0] for _, slopes in parts], axis=0)
-
-    def _evaluate_jacobian(self, points: Array, theta: Array) -> Array:
-        q, parameters = ca.MX.sym("q", points.shape[1], len(points)), ca.MX.sym("theta", self._family.size)
-        gradients = ca.vertcat(*self._family.jacobian(q, parameters))
-        (J,) = NumpyGraph("J_xi", [q, parameters], [gradients])(
-            np.ascontiguousarray(points), np.ascontiguousarray(theta)
-        )
-        return J.reshape(len(points), self._family.outputs, -1)
 
     def _hold(self, points: Array, entries: Array, room: int) -> None:
         # The graph takes all samples at once, or fewer, so that its matrices fit the cache
