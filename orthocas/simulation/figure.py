@@ -94,7 +94,7 @@ def trajectory_figure(trajectory: "Trajectory", units: Mapping[str, str] | None 
     others[0].legend(fontsize=7, loc="lower left", bbox_to_anchor=(0, 1), ncols=min(names, 4), frameon=False)
     others[1].plot(trajectory.times, trajectory.command, linewidth=1.3)
     others[1].set_ylabel(f"torque [{force}]" if torque else f"velocity [{speed}]", fontsize=9)
-    # Below, for torque controllers, the storage.
+    # For torque controllers, draw the storage below.
     if torque:
         storage = np.where(trajectory.fell_back, np.nan, trajectory.storage)
         others[2].plot(trajectory.times, storage, color=_STORAGE, linewidth=1.3)

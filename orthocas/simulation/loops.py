@@ -194,7 +194,7 @@ def run_compiled(function: ca.Function, *arguments: Any, **named: Any) -> Any:
         try:
             return function(*arguments, **named)
         except RuntimeError as error:
-            raise SimulationError(f"CVODES gave up: {str(error)[:200]}") from None
+            raise SimulationError(f"CVODES failed: {str(error)[:200]}") from None
 
 
 def list_cvodes_options(tolerance: float, stiff: bool) -> dict[str, Any]:

@@ -145,7 +145,7 @@ class Trajectory(Shown):
 
     @property
     def catches(self) -> tuple[tuple[float, ControlStatus], ...]:
-        """Times of catches of a supervised law [s], with reasons; OK: the run started too near the boundary."""
+        """Times of catches of a supervised law [s] and their reasons; OK if the run started too near the boundary."""
         caught = self.status == ControlStatus.CAUGHT
         first = np.flatnonzero(caught & ~np.concatenate([[False], caught[:-1]]))
         return tuple((float(self.times[i]), ControlStatus(int(self.cause[i]))) for i in first)
