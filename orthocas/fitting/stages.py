@@ -354,7 +354,7 @@ class Continuation:
         return count if kept is None or self.settings.samples else ceil(count / 2)
 
     def _count_for_basis(self, terms: int, r: int) -> int:
-        """Samples of a linear family: 70 to 140 residuals per coefficient, and up to 8 joints 1000 samples beside."""
+        """Samples of a linear family: 70 to 140 residuals per coefficient; up to 8 joints, 1000 samples are added."""
         rows = self.problem.m + r - 1
         if self.problem.n > RULES.many_joints:
             return self.settings.samples or ceil(RULES.residuals_of_many * terms / rows)
@@ -486,7 +486,7 @@ class FitSettings:
         return cls(bound, solver, loss, count, tag, max_mutual_deg, split_idle, precision, quantities)
 
     def add_term(self, term: LikeTerm) -> Self:
-        """The settings with the term that holds coordinates to quantities among the weights."""
+        """The settings with the loss term of the quantities that coordinates follow."""
         register_loss_term(term)
         return replace(self, weights=replace(self.weights, extra={**self.weights.extra, term.name: LIKE_RULES.weight}))
 

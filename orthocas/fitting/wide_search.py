@@ -418,8 +418,9 @@ class Search:
         """
         weights = self._choose_weights(volume)
         assert isinstance(self.family, LinearFamily)
-        # Each set of samples counts by its number of samples. The first one has all terms
+        # Mean lengths of the gradients where this descent begins
         lengths = np.linalg.norm(self._last.reshape(self.problem.r, -1) @ self._factor, axis=1)
+        # The first samples have all terms
         if self._objectives:
             self._objectives[0] = self._objectives[0].reweigh(weights)
         else:
@@ -428,6 +429,7 @@ class Search:
         # Objectives of the worst samples that were added since
         for samples in self._samples[len(self._objectives) :]:
             self._objectives.append(self._objectives[0].elsewhere(samples, self._weigh_regularity(volume)))
+        # The loss is the mean over all samples
         count = sum(len(samples) for samples in self._samples)
         parts: list[tuple[float, Objective]] = [
             (len(samples) / count, objective)
