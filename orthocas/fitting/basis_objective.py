@@ -253,7 +253,7 @@ class BasisObjective:
         names = [f"{stride} {row.tobytes().hex()}" for row in self.kept]
         for name, row in zip(names, self.kept, strict=True):
             if name not in self._expanded:
-                self._expanded[name] = self._gradients.expand_part(self.X, self.N, row, stride, np.float32)
+                self._expanded[name] = self._gradients.expand(self.X, self.N, row, stride, np.float32)
         return [self._expanded[name] for name in names]
 
     def _table(self, theta: Array) -> Array:
@@ -466,22 +466,23 @@ class BasisGradients(ABC):
         """dL/dC (r, K) of a function L, from its slopes dL/dT (g, n r / g, S)."""
 
     @abstractmethod
-    def expand_part(
-        self, X: Array, samples: int, kept: NDArray[np.bool_], every: int = 1, dtype: DTypeLike | None = None
+    def expand(
+        self,
+        X: Array,
+        samples: int,
+        kept: NDArray[np.bool_] | None = None,
+        every: int = 1,
+        dtype: DTypeLike | None = None,
     ) -> Array:
-        """Gradients d psi_k / dq_i of some functions at some samples, zeros included, (samples, n, kept).
+        """Gradients d psi_k / dq_i, zeros included, (samples / every, n, functions).
 
         Args:
             X: result of `at`, (B, g, S, c).
             samples: number of samples, without the padding of the last block.
-            kept: the functions, (K,).
+            kept: the functions, (K,). Default: all.
             every: take only every second, third, ... sample, a divisor of c.
             dtype: type of the numbers. Default: that of X.
         """
-
-    def expand(self, X: Array, samples: int) -> Array:
-        """All gradients at all samples, (N, n, K)."""
-        return self.expand_part(X, samples, np.ones(self.family.width, dtype=bool))
 
     def square(self, X: Array, squares: Sequence[Array], kept: NDArray[np.bool_]) -> list[Array]:
         """Sums over samples of G^T W_j G for every coordinate j, with gradients G (n, K_j) of its functions.
@@ -495,7 +496,7 @@ class BasisGradients(ABC):
         """
         found = []
         for W, own in zip(squares, kept, strict=True):
-            G = self.expand_part(X, len(W), own, dtype=np.float32)
+            G = self.expand(X, len(W), own, dtype=np.float32)
             rows = W.astype(np.float32) @ G
             found.append((G.reshape(-1, G.shape[2]).T @ rows.reshape(-1, G.shape[2])).astype(float))
         return found
@@ -564,11 +565,17 @@ class ProductGradients(BasisGradients):
         rows: Array = (self._back @ by_joint.reshape(-1, by_joint.shape[2])).T
         return rows
 
-    def expand_part(
-        self, X: Array, samples: int, kept: NDArray[np.bool_], every: int = 1, dtype: DTypeLike | None = None
+    def expand(
+        self,
+        X: Array,
+        samples: int,
+        kept: NDArray[np.bool_] | None = None,
+        every: int = 1,
+        dtype: DTypeLike | None = None,
     ) -> Array:
         """Gradients as D_i psi'."""
         assert X.shape[3] % every == 0
+        kept = np.ones(self.family.width, dtype=bool) if kept is None else kept
         kind = X.dtype if dtype is None else np.dtype(dtype)
         values = X[:, 0, :, ::every].transpose(1, 0, 2).reshape(X.shape[2], -1)[:, : -(-samples // every)]
         # Take the rows of these functions from all D_i, (n kept, S), and keep them for the next call
@@ -650,12 +657,18 @@ class SparseGradients(BasisGradients):
             total[:, places[used]] += part[:, used]
         return total
 
-    def expand_part(
-        self, X: Array, samples: int, kept: NDArray[np.bool_], every: int = 1, dtype: DTypeLike | None = None
+    def expand(
+        self,
+        X: Array,
+        samples: int,
+        kept: NDArray[np.bool_] | None = None,
+        every: int = 1,
+        dtype: DTypeLike | None = None,
     ) -> Array:
         """Gradients with the numbers X in their places, and zeros elsewhere."""
         B, n, _, c = X.shape
         assert c % every == 0
+        kept = np.ones(self.family.width, dtype=bool) if kept is None else kept
         # Put each joint's numbers at the places of its functions among the chosen ones
         place = np.cumsum(kept) - 1
         dense = np.zeros((B, c // every, n, kept.sum()), dtype=X.dtype if dtype is None else dtype)

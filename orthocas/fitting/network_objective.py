@@ -220,7 +220,7 @@ class _LossGraph:
     def __init__(self, family: Family, loss: Loss, columns: int) -> None:
         # Replay the graph of one sample's loss on columns: every operation then acts on all samples
         theta, q = ca.MX.sym("theta", family.size), ca.MX.sym("q", loss.sizes.n, columns)
-        data = ca.MX.sym("data", columns, sum(symbol.numel() for symbol in loss.symbols()))
+        data = ca.MX.sym("data", columns, sum(symbol.numel() for symbol in loss.arguments()[1]))
         share = ca.MX.sym("share", columns)
         gradients = family.jacobian(q, theta)
         # The entries of J_xi in the order of the graph's inputs, each a column with all samples

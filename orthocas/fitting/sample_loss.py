@@ -98,10 +98,6 @@ class Loss:
         kept = tuple(pair for pair in self.weights if pair[0] not in names)
         return Loss(self.sizes, kept, self.exchanged) if names else self
 
-    def symbols(self) -> list[ca.SX]:
-        """CasADi symbols for the data of one sample, in the order of `data`."""
-        return [ca.SX.sym(name, *SAMPLE_DATA[name](self.sizes)) for name in self.data]
-
     def residuals(self, coordinate_jacobian: ca.SX, data: list[ca.SX]) -> ca.SX:
         """Residuals rho of one sample, (rows, 1)."""
         named = dict(zip(self.data, data, strict=True))
@@ -157,13 +153,14 @@ class Loss:
         return [sorted(coordinates) for coordinates in touched]
 
     def arguments(self) -> tuple[ca.SX, list[ca.SX]]:
-        """CasADi symbols for J_xi (r, n) and for the data of one sample."""
-        return ca.SX.sym("J", self.sizes.r, self.sizes.n), self.symbols()
+        """CasADi symbols for J_xi (r, n) and for the data of one sample, in the order of `data`."""
+        symbols = [ca.SX.sym(name, *SAMPLE_DATA[name](self.sizes)) for name in self.data]
+        return ca.SX.sym("J", self.sizes.r, self.sizes.n), symbols
 
 
 @cache
 def build_sample_loss(loss: Loss) -> ca.Function:
-    """Loss of one sample (1, 1) as a function of J_xi (r, n) and the data of `Loss.symbols`."""
+    """Loss of one sample (1, 1) as a function of `Loss.arguments`."""
     J, data = loss.arguments()
     return ca.Function("build_sample_loss", [J, *data], [ca.sumsqr(loss.residuals(J, data)) / 2])
 
