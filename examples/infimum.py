@@ -63,7 +63,7 @@ class Integrand:
         loss = Loss.of(Sizes(problem.n, problem.m, problem.r, problem.metric.is_identity), weights.by_name)
         described = samples.collect_data(loss.data, samples.orientation(orient))
         flat = [part.reshape(len(points), -1) for part in described]
-        rows, symbols = ca.SX.sym("J", problem.n, problem.r), loss.symbols()
+        rows, symbols = ca.SX.sym("J", problem.n, problem.r), loss.arguments()[1]
         turned = [ca.SX.sym("part", s.shape[1], s.shape[0]) for s in symbols]  # NumPy has rows first
         stacked = ca.vertcat(ca.vec(rows), *(ca.vec(part) for part in turned))
         rho = loss.residuals(rows.T, [part.T for part in turned])

@@ -176,35 +176,32 @@ def bound_conditioning(J: TaylorModel, m: int) -> Array:
     n = len(J.remainder)
     if m == n:
         return np.ones(J.remainder.shape[-1])
+    # The volume that the gradients of the coordinates span across those of the task.
     with np.errstate(invalid="ignore", over="ignore", divide="ignore"):
-        volume = bound_from_below(_build_volume(J, m)) * _ORTHOGONAL
+        # In the singular basis of the task rows, these rows are nearly diagonal.
+        left, right = find_singular_vectors(J[:m])
+        unit = np.broadcast_to(np.eye(1), (len(right), 1, 1))
+        task = multiply_between(left, J[:m], right)
+        gradients = stack([multiply_between(unit, J[j : j + 1], right)[0] for j in range(m, n)])
+        # Normalise the gradients to length 1.
+        squares = gradients * gradients
+        squared_lengths = _sum_models([squares[:, k] for k in range(squares.remainder.shape[1])])
+        gradients = gradients * reciprocal_square_root(squared_lengths)[:, None]
+        # Project them on the kernel [X; I] of the task, whose basis has the volume det(I + X X^T)^(1/2).
+        kernel = _solve_kernel(task, m)
+        across = gradients[:, m:] + _sum_models([gradients[:, k, None] * kernel[None, k] for k in range(m)])
+        turned, _ = rotate_to_singular_basis(across)
+        products = kernel[:, None] * kernel[None]
+        gram = _sum_models([products[:, :, k] for k in range(products.remainder.shape[2])])
+        growth = compute_pivots(gram + TaylorModel.constant(np.eye(m)[:, :, None]))
+        factors = [*compute_pivots(turned), *map(reciprocal_square_root, growth)]
+        volume = bound_from_below(reduce(mul, factors)) * _ORTHOGONAL
     volume = np.clip(np.nan_to_num(volume, nan=0.0), 0.0, 1.0)
     # Least of n singular values with this product, whose squares sum to n. Each iteration improves the bound.
     least = np.zeros_like(volume)
     for _ in range(4):
         least = volume * ((n - 1) / (n - least * least)) ** ((n - 1) / 2) / UP
     return least
-
-
-def _build_volume(J: TaylorModel, m: int) -> TaylorModel:
-    """The volume that the gradients of the coordinates span across those of the task, (boxes,)."""
-    # In the singular basis of the task rows, these rows are nearly diagonal.
-    left, right = find_singular_vectors(J[:m])
-    unit = np.broadcast_to(np.eye(1), (len(right), 1, 1))
-    task = multiply_between(left, J[:m], right)
-    gradients = stack([multiply_between(unit, J[j : j + 1], right)[0] for j in range(m, len(J.remainder))])
-    # Normalise the gradients to length 1.
-    squares = gradients * gradients
-    squared_lengths = _sum_models([squares[:, k] for k in range(squares.remainder.shape[1])])
-    gradients = gradients * reciprocal_square_root(squared_lengths)[:, None]
-    # Project them on the kernel [X; I] of the task, whose basis has the volume det(I + X X^T)^(1/2).
-    kernel = _solve_kernel(task, m)
-    across = gradients[:, m:] + _sum_models([gradients[:, k, None] * kernel[None, k] for k in range(m)])
-    turned, _ = rotate_to_singular_basis(across)
-    products = kernel[:, None] * kernel[None]
-    gram = _sum_models([products[:, :, k] for k in range(products.remainder.shape[2])])
-    growth = compute_pivots(gram + TaylorModel.constant(np.eye(m)[:, :, None]))
-    return reduce(mul, [*compute_pivots(turned), *map(reciprocal_square_root, growth)])
 
 
 def _solve_kernel(task: TaylorModel, m: int) -> TaylorModel:

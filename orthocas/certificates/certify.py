@@ -128,7 +128,27 @@ def certify(
     injective: Subdivision | None = None
 
     def build_so_far() -> Certificate:
-        return _build_certificate(chart, check.method, bound, search, injective, time.monotonic() - start, resume)
+        """The certificate of what is proved so far, with the boxes and the bounds of an earlier search."""
+        boxes, conditioning, seconds = search.evaluated, search.conditioning, time.monotonic() - start
+        if resume is not None:
+            boxes, seconds = boxes + resume.boxes, seconds + resume.seconds
+            if resume.conditioning:
+                conditioning = min(conditioning, resume.conditioning)
+        domain, parts = chart.problem.domain, search.build_subdivision()
+        return Certificate(
+            fingerprint(chart.problem, chart.coordinates),
+            check.method,
+            bound,
+            parts,
+            conditioning * (1 - 1e-9) if bound > 0 and np.isfinite(conditioning) else 0.0,
+            injective,
+            tuple(tuple(point.tolist()) for point in search.signs.values()) if search.folded else (),
+            boxes,
+            seconds,
+            getattr(domain, "least_singular_value", 0.0),
+            getattr(domain, "least_volume", 0.0),
+            _estimate_proved_fraction(domain, parts),
+        ).seal()
 
     # First look for folds, then prove all parts. The remaining time is for the one-to-one box.
     try:
@@ -348,39 +368,6 @@ def _try_scales(boxes: Sequence[Array], prove: Callable[[Array, int], bool], mos
         low += 2
     if low < len(boxes):
         prove(boxes[low], most)
-
-
-def _build_certificate(
-    chart: Chart,
-    method: str,
-    bound: float,
-    search: Search,
-    injective: Subdivision | None,
-    seconds: float,
-    resume: Certificate | None,
-) -> Certificate:
-    fold = tuple(tuple(point.tolist()) for point in search.signs.values()) if search.folded else ()
-    # Add the boxes and the bounds of an earlier search.
-    boxes, conditioning = search.evaluated, search.conditioning
-    if resume is not None:
-        boxes, seconds = boxes + resume.boxes, seconds + resume.seconds
-        if resume.conditioning:
-            conditioning = min(conditioning, resume.conditioning)
-    domain, parts = chart.problem.domain, search.build_subdivision()
-    return Certificate(
-        fingerprint(chart.problem, chart.coordinates),
-        method,
-        bound,
-        parts,
-        conditioning * (1 - 1e-9) if bound > 0 and np.isfinite(conditioning) else 0.0,
-        injective,
-        fold,
-        boxes,
-        seconds,
-        getattr(domain, "least_singular_value", 0.0),
-        getattr(domain, "least_volume", 0.0),
-        _estimate_proved_fraction(domain, parts),
-    ).seal()
 
 
 def _estimate_proved_fraction(domain: Domain, parts: Subdivision) -> float:

@@ -147,12 +147,22 @@ class Determinant:
         centre = ((low + high) / 2)[:, chosen].T
         half = np.nextafter(np.maximum(high[:, chosen].T - centre, centre - low[:, chosen].T), np.inf) + TINY
         (A, rest_a), (B, rest_b) = self.slopes(centre, half), self.cofactors(centre, half)
+        B, last = B[:-1], B[-1]
+        # Sum the products of the pairs of factors up to the degree, monomial by monomial.
+        products, n, degree = np.zeros((B.shape[1], A.shape[2])), len(chosen), self.slopes.degree
+        for of_a, k, others, where in _plan_products(n, degree):
+            one, many = (A[:, k], B[:, others]) if of_a else (B[:, k], A[:, others])
+            products[where] += np.einsum("in,ikn->kn", one, many)
+        # Bound the products of higher degree.
+        size_a, size_b = _sum_by_degree(A, n, degree), _sum_by_degree(B, n, SERIES_DEGREE)
+        rest = np.zeros(A[:, 0].shape)
+        for i, a in enumerate(size_a):
+            rest += a * size_b[max(0, SERIES_DEGREE + 1 - i) :].sum(axis=0)
         # The truncation error of each factor is multiplied by the size of the other.
-        products, rest = _multiply_expansions(A, B[:-1], self.slopes.degree, len(chosen))
-        total_a, total_b = (np.abs(part).sum(axis=1) for part in (A, B[:-1]))
+        total_a, total_b = (np.abs(part).sum(axis=1) for part in (A, B))
         carried = rest_a * (total_b + rest_b[:-1]) + total_a * rest_b[:-1] + rest
         carried += sum_error(_SPLITS * len(A)) * total_a * total_b
-        coefficients = products + B[-1]
+        coefficients = products + last
         unknown = carried.sum(axis=0) + rest_b[-1] + UNIT * np.abs(coefficients).sum(axis=0)
         return coefficients, unknown * compute_margin(A.shape[1] + len(coefficients)) + TINY
 
@@ -318,21 +328,6 @@ def _plan_products(n: int, degree: int) -> tuple[tuple[bool, int, slice, NDArray
                 where = np.array([place[tuple(sorted(one + other))] for other in every[others]])
                 plan.append((of_a, k, others, where))
     return tuple(plan)
-
-
-def _multiply_expansions(A: Array, B: Array, degree: int, n: int) -> Expansion:
-    """sum_i A_i B_i for factors (pairs, monomials, boxes), and its truncation error, (pairs, boxes)."""
-    out = np.zeros((B.shape[1], A.shape[2]))
-    # Products up to the degree, monomial by monomial.
-    for of_a, k, others, where in _plan_products(n, degree):
-        one, many = (A[:, k], B[:, others]) if of_a else (B[:, k], A[:, others])
-        out[where] += np.einsum("in,ikn->kn", one, many)
-    # Bounds of all products of higher degree.
-    size_a, size_b = _sum_by_degree(A, n, degree), _sum_by_degree(B, n, SERIES_DEGREE)
-    left_out = np.zeros(A[:, 0].shape)
-    for i, a in enumerate(size_a):
-        left_out += a * size_b[max(0, SERIES_DEGREE + 1 - i) :].sum(axis=0)
-    return out, left_out
 
 
 def _sum_by_degree(coefficients: Array, n: int, degree: int) -> Array:

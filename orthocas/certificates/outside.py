@@ -168,7 +168,7 @@ def _find_periodic_inputs(coordinates: Coordinates) -> set[int]:
 
 
 def _find_unchanged(tape: Tape, n: int) -> set[int]:
-    """The joints whose full turns do not change a gradient."""
+    """The joints that may make full turns without changing a gradient."""
     needed = {k for row in find_gradient_dependences(tape) for joints in row.values() for k in joints}
     return {k for k in range(n) if k not in needed} | find_periodic_joints(tape, n)
 

@@ -40,13 +40,17 @@ Enclosed = tuple[Array, Array]  #: values, and bounds of their absolute errors
 
 
 def sum_error(products: int) -> float:
-    """Error of a sum of so many products, relative to the sum of their absolute values, with 8 spare roundings."""
+    """Bound of the rounding error of a sum of products, relative to the sum of their absolute values.
+
+    Args:
+        products: number of products; 8 further roundings are included.
+    """
     # k u / (1 - k u) < 1.01 k u for k below 10^13.
     return 1.01 * (products + 8) * UNIT
 
 
 def compute_margin(products: int) -> float:
-    """Factor that makes a computed sum of so many products of non-negative numbers an upper bound."""
+    """Factor that turns a computed sum of `products` products of non-negative numbers into an upper bound."""
     return UP * (1 + sum_error(products))
 
 
@@ -59,7 +63,7 @@ def list_monomials(variables: Variables, degree: int = DEGREE) -> tuple[Monomial
 
 @cache
 def find_order_starts(count: int) -> tuple[int, ...]:
-    """Index of the first monomial of each degree 0, 1, 2, 3 in so many variables, and the number of all monomials."""
+    """Index of the first monomial of each degree 0, 1, 2, 3 in `count` variables, and the number of all monomials."""
     linear, quadratic = 1 + count, (1 + count) * (2 + count) // 2
     return 0, 1, linear, quadratic, quadratic * (3 + count) // 3
 

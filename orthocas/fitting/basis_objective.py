@@ -1,4 +1,4 @@
-"""The loss of bases as least squares: J_xi is linear in theta, normal equations come in blocks."""
+"""The loss of bases, whose J_xi is linear in theta: value, gradient and Gauss-Newton matrix, built in blocks."""
 
 from __future__ import annotations
 
@@ -35,22 +35,22 @@ from orthocas.tools.columns import COLUMNS, ColumnFunction, Run, arrange_blocks,
 
 @dataclass(frozen=True, slots=True)
 class ObjectiveRules:
-    """Numbers of the products that evaluate losses. They were chosen by the time that a product takes."""
+    """Sizes and sample counts of the products that evaluate losses, chosen for short computing times."""
 
-    chunk: int = 512  #: samples per product of a matrix, so that the rows stay in the cache
+    chunk: int = 512  #: samples per matrix product, so that their rows stay in the cache
     blocks: int = 8  #: blocks of samples per thread: fixed, so that sums do not depend on the number of threads
-    stride: int = 2  #: every second sample estimates the Gauss-Newton matrix, which is a mean, well enough
+    stride: int = 2  #: every second sample is enough for the Gauss-Newton matrix, which is a mean
     most_stride: int = 16  #: of rough estimates; a divisor of the samples in a block
     hinges: int = 1000  #: samples that estimate the Gauss-Newton matrix of a hinge, about
-    coupled: int = 1500  #: coefficients up to which an estimate holds what couples coordinates
+    coupled: int = 1500  #: coefficients up to which rough estimates contain blocks that couple coordinates
     rough: int = 12  #: residuals per coefficient in a rough estimate
     rough_in_metric: int = 6  #: the same in another metric than the identity, where more estimates are needed
 
     orienting: int = 200  #: samples that determine the orientation of a network's start
-    piece: int = 2**18  #: entries of the largest array of a piece of samples; larger ones leave the cache
+    piece: int = 2**18  #: entries of the largest array of a piece of samples; larger ones do not fit the cache
     products: int = 2**22  #: products of pairs of numbers of a basis at once
     least_piece: int = 100  #: samples in a piece; smaller products waste time
-    graph: int = 2**20  #: entries of the largest matrix in a graph; larger ones leave the cache
+    graph: int = 2**20  #: entries of the largest matrix in a graph; larger ones do not fit the cache
 
 
 RULES = ObjectiveRules()
@@ -60,10 +60,10 @@ Shared = Sequence[tuple[int, int, int, int]]
 class BasisObjective:
     """Mean loss (25) of xi = C psi(q) on fixed samples, with gradient, Gauss-Newton matrix and Hessian.
 
-    With the numbers X of the basis gradients sampled once, the coordinate gradients are J_xi = T X, with a table T that
+    The numbers X of the basis gradients are computed once. The coordinate gradients are J_xi = T X, with a table T that
     is linear in C, see `BasisGradients`. The loss of one sample and its derivatives with respect to J_xi come from
-    CasADi. The residual of task i and coordinate j depends only on row j of C, so the Gauss-Newton matrix is built
-    block by block from few rows per sample.
+    CasADi, or from arrays for many coordinates. The residual of task i and coordinate j depends only on row j of C, so
+    the Gauss-Newton matrix is built block by block from few rows per sample.
 
     Samples are stored in the blocks of `orthocas.tools.columns`: X is (B, g, S, c) and J_xi is (B, n r, c).
 
@@ -71,14 +71,14 @@ class BasisObjective:
         family: the coordinates.
         samples: fixed samples of the family's joints.
         weights: weights of the loss.
-        start: parameters, (size,), whose orientation the regularity term keeps.
+        start: parameters, (size,). The regularity term keeps the orientation of their coordinates.
         draw: draws fresh samples.
         kept: the coefficients (r, K) that may differ from zero; theta holds only these. Default: all.
         exchanged: pairs of components whose sum and difference are coordinates, see `orthocas.fitting.starts`. Then
             C and J_xi are those of the components.
-        gradients: gradients of the basis, if they are known already, or of another type than float64; products with
-            them are computed with numbers of that type. Default: those of the family.
-        orientation: sign of the volume of the coordinates that the regularity term keeps. Default: that of the start.
+        gradients: gradients of the basis, if they exist already, or with numbers of another type than float64, which
+            products with them then have too. Default: those of the family.
+        orientation: sign of the coordinates' volume, which the regularity term keeps. Default: that of the start.
     """
 
     def __init__(
@@ -107,7 +107,7 @@ class BasisObjective:
 
         Args:
             samples: the samples.
-            start: parameters that give the orientation, unless it is known.
+            start: parameters whose coordinates give the orientation, unless it is set already.
         """
         self.N, self.X = len(samples), self._gradients.at(samples.points)
         self._share, self._expanded = build_weights(self.N), dict[str, Array]()
@@ -139,14 +139,14 @@ class BasisObjective:
 
     def value_and_gradient(self, theta: Array) -> tuple[float, Array]:
         """L(theta) and dL/dtheta."""
-        # J_xi = T X block by block; the loss and its slopes there; and the slopes times X^T, which are dL/dT
+        # For each block: J_xi = T X, the loss and its slopes dL/dJ_xi, and dL/dT, which is the slopes times X^T
         T, columns, parts = self._table(theta), build_loss_columns(self._loss), self._parts
         arrays = (self.X, self._share, *self._data)
 
         def sum_part(run: Run, part: slice) -> tuple[float, Array]:
             value, gradient = 0.0, np.zeros(T.shape)
             losses, slopes = np.empty(COLUMNS), np.empty((self.n * self.r, COLUMNS))
-            # One block at a time, so that X leaves memory only once
+            # One block at a time, so that X is read from memory only once
             for X, share, *data in zip(*(array[part] for array in arrays), strict=True):
                 run([(T @ X).astype(np.float64, copy=False), *data], [losses, slopes])
                 value += float(losses @ share)
@@ -160,17 +160,18 @@ class BasisObjective:
         return sum(value for value, _ in sums), slopes[self.kept]
 
     def normal_equations(self, theta: Array) -> tuple[float, Array, Array]:
-        """L(theta), its gradient, and the Gauss-Newton matrix, computed with products in single precision."""
+        """L(theta), its gradient, and the Gauss-Newton matrix, whose products are computed in single precision."""
         value, gradient = self.value_and_gradient(theta)
         return value, gradient, self._build_matrix(theta, RULES.stride)
 
     def curvature_estimate(self, theta: Array) -> list[Array]:
-        """The Gauss-Newton matrix from as few samples as steer a quasi-Newton method: one block, or its diagonal ones.
+        """A rough Gauss-Newton matrix for quasi-Newton methods; beyond 1500 coefficients only its diagonal blocks.
 
-        With n joints, r coordinates have about r n^2 / 2 coefficients. The whole matrix takes n^6 operations, and n^9
-        to factor. Its blocks, one for each coordinate, take n^5 and n^7.
+        It is estimated from few samples. With n joints, r coordinates of degree 2 have about r n^2 / 2 coefficients.
+        The whole matrix takes about n^6 operations, and n^9 to factor. Its blocks, one for each coordinate, take n^5
+        and n^7.
         """
-        # As few samples as leave enough residuals for each coefficient
+        # Double the stride as long as there are enough residuals for each coefficient
         residuals = self.N * (self._loss.smooth_count or 1)
         rough = RULES.rough if self._loss.sizes.identity_metric else RULES.rough_in_metric
         stride = RULES.stride
@@ -180,12 +181,12 @@ class BasisObjective:
 
     def hessian(self, theta: Array) -> Array:
         """d^2L/dtheta^2, exact, (size, size)."""
-        # Second derivatives with respect to J_xi at each sample, then the gradients of the basis on both sides
+        # With second derivatives W with respect to J_xi and basis gradients G, the Hessian is the mean of G^T W G
         r, n, K = self.r, self.n, self.K
         (curvature,) = build_curvature_columns(self._loss)(self._evaluate_jacobians(theta), *self._data)
         W = split_by_sample(curvature.reshape(-1, n * r, n * r, curvature.shape[2]), self.N).reshape(-1, n, r, n, r)
         G, H = self._dense, np.zeros((r, K, r, K))
-        # Each pair of coordinates is a block, filled by one thread
+        # Each pair of coordinates has a block, which one thread fills
 
         def fill(pair: tuple[int, int]) -> None:
             i, j = pair
@@ -196,7 +197,7 @@ class BasisObjective:
             H[j, :, i] = H[i, :, j].T
 
         run_in_threads(fill, [(i, j) for i in range(r) for j in range(i + 1)])
-        # Coefficients that may differ from zero
+        # Take the rows and columns of coefficients that may differ from zero
         free = self.kept.ravel()
         block: Array = H.reshape(r * K, r * K)[np.ix_(free, free)]
         return block
@@ -221,12 +222,12 @@ class BasisObjective:
         return other
 
     def move_to(self, gradients: BasisGradients, samples: Samples, start: Array) -> Self:
-        """The same loss of the same family on another box, without building it again.
+        """The same loss of the same family on another box; its compiled functions are reused.
 
         Args:
             gradients: gradients of the basis there.
             samples: the samples.
-            start: parameters whose orientation the regularity term keeps.
+            start: parameters; the regularity term keeps the orientation of their coordinates.
         """
         other = copy(self)
         other._gradients, other._orientation = gradients, None
@@ -252,7 +253,7 @@ class BasisObjective:
         names = [f"{stride} {row.tobytes().hex()}" for row in self.kept]
         for name, row in zip(names, self.kept, strict=True):
             if name not in self._expanded:
-                self._expanded[name] = self._gradients.expand_part(self.X, self.N, row, stride, np.float32)
+                self._expanded[name] = self._gradients.expand(self.X, self.N, row, stride, np.float32)
         return [self._expanded[name] for name in names]
 
     def _table(self, theta: Array) -> Array:
@@ -271,23 +272,23 @@ class BasisObjective:
         return J.reshape(len(J), self.n * self.r, -1)
 
     def _build_matrix(self, theta: Array, stride: int) -> Array:
-        """Gauss-Newton matrix; that of the smooth residuals from every `stride`-th sample."""
+        """Gauss-Newton matrix, (size, size). Its smooth residuals are taken at every `stride`-th sample."""
         smooth, hinges = self._differentiate(theta, stride)
         free, rows = int(self.kept.sum()), self._loss.smooth_rows
         H = np.zeros((free, free))
         if smooth:
-            # Blocks of coordinate pairs, from few rows per sample in single precision
+            # Blocks of coordinates and of pairs of them, from few rows per sample, in single precision
             shared = [(i, j, rows[i].index(row), rows[j].index(row)) for i, j, row in self._loss.shared_rows]
             gradients = self._thin(stride)
             H = build_normal_matrix(smooth, gradients, shared) / len(gradients[0])
-        # A hinge couples all coordinates, but acts at few samples
+        # A hinge couples all coordinates, so its rows are full, but it acts at few samples
         for D, G, count in hinges:
             active = (D @ G)[:, self.kept]
             H += (active.T @ active).astype(float) / count
         return H
 
     def _build_blocks(self, theta: Array, stride: int) -> list[Array]:
-        """The diagonal blocks of the same matrix, one for the coefficients of each coordinate."""
+        """The diagonal blocks of the Gauss-Newton matrix, one for the coefficients of each coordinate."""
         if self._loss.all_by_arrays:
             return self._build_by_arrays(theta, stride)
         smooth, hinges = self._differentiate(theta, stride)
@@ -297,7 +298,7 @@ class BasisObjective:
             if smooth:
                 gradients = self._thin(stride)[j : j + 1]
                 H = build_normal_matrix(smooth[j : j + 1], gradients, ()) / len(gradients[0])
-            # A hinge couples coordinates; here each keeps its own part
+            # Of a hinge, which couples coordinates, a diagonal block holds only the part of its own coordinate
             for D, G, count in hinges:
                 active = (D[:, j : j + 1] @ G)[:, 0, self.kept[j]]
                 H += (active.T @ active).astype(float) / count
@@ -306,9 +307,9 @@ class BasisObjective:
         return [build(j) for j in range(self.r)]
 
     def _build_by_arrays(self, theta: Array, stride: int) -> list[Array]:
-        """The same blocks from the squares D^T D of all residuals at every `stride`-th sample."""
+        """Like `_build_blocks`, from the squares D^T D of all residuals at every `stride`-th sample."""
         if not self._loss.smooth_count:
-            # Hinges alone have one residual a sample, so they need more of them
+            # Hinges alone give one residual a sample, so more samples are needed
             stride = 1
             while stride * RULES.hinges < self.N:
                 stride *= 2
@@ -317,7 +318,7 @@ class BasisObjective:
         J = (self._table(theta) @ X).astype(np.float64, copy=False).reshape(len(X), self.n * self.r, -1)
         data = [array[..., ::stride] for array in self._data]
         blocks = [loss.build_curvatures(J[b], [array[b] for array in data]) for b in range(len(X))]
-        # Without the padding of the last block
+        # Leave out the padding of the last block
         count = -(-self.N // stride)
         squares = [np.concatenate(parts)[:count] for parts in zip(*blocks, strict=True)]
         return [total / count for total in self._gradients.square(X, squares, self.kept)]
@@ -326,9 +327,10 @@ class BasisObjective:
         """Derivatives of residuals with respect to J_xi, in single precision.
 
         Returns:
-            Those of the smooth residuals of each coordinate at every `stride`-th sample, (N / stride, rows, n); none
-            if there are none. And for each hinge (N', r, n) at some of the samples where it acts, with gradients of the
-            basis there (N', n, K), and by what their products are divided.
+            Two lists. The first has the derivatives of each coordinate's smooth residuals at every `stride`-th sample,
+            (N / stride, rows, n); it is empty without smooth residuals. The second has, for each hinge, its
+            derivatives (N', r, n) at some of the samples where it acts, the gradients of the basis there (N', n, K),
+            and the number by which sums of their products are divided to give means.
         """
         derivatives = build_residual_columns(self._loss)(self._evaluate_jacobians(theta), *self._data)
         smooth, hinges = list[Array](), list[tuple[Any, Any, float]]()
@@ -337,9 +339,9 @@ class BasisObjective:
                 blocks = derivative.reshape(len(derivative), self.n, -1, derivative.shape[2])
                 smooth.append(split_by_sample(blocks, self.N, stride).astype(np.float32))
         for residual, derivative in zip(derivatives[self.r :: 2], derivatives[self.r + 1 :: 2], strict=True):
-            # Only samples at which the hinge acts, without the padding of the last block
+            # Take the samples at which the hinge acts, without the padding of the last block
             block, column = np.nonzero((residual[:, 0] > 0) & (self._share > 0))
-            # Where it acts at most samples, some of them estimate the matrix well enough
+            # If these are many, about 1000 of them are enough for the matrix
             every = max(1, len(block) // RULES.hinges)
             block, column = block[::every], column[::every]
             D = derivative[block, :, column].reshape(-1, self.n, self.r).transpose(0, 2, 1).astype(np.float32)
@@ -357,21 +359,22 @@ def expand(theta: Array, kept: NDArray[np.bool_]) -> Array:
 
 
 def build_normal_matrix(derivatives: Sequence[Array], gradients: Sequence[Array], shared: Shared) -> Array:
-    """Sums over samples of X_j^T X_j, and of x_i^T x_j for residuals that two coordinates share, (size, size).
+    """The matrix (size, size) whose blocks are sums over samples: X_j^T X_j, and x_i^T x_j of shared residuals.
 
-    X_j = D_j G_j are the derivatives of the residuals of coordinate j with respect to its coefficients. Products are
-    taken over chunks of samples, and added in double precision in the order of the chunks.
+    X_j = D_j G_j are the derivatives of the residuals of coordinate j with respect to its coefficients, and x_i, x_j
+    the rows of a residual that depends on two coordinates. Products are taken over chunks of samples, and added in
+    double precision in the order of the chunks.
 
     Args:
         derivatives: D_j of every coordinate, (N, rows, n).
         gradients: G_j of every coordinate, (N, n, K_j).
-        shared: coordinates i > j and the places of their shared residual among the rows of X_i and of X_j.
+        shared: for every residual of two coordinates i > j: i, j, and its row in X_i and in X_j.
     """
     r, ends = len(derivatives), np.cumsum([G.shape[2] for G in gradients])
     places = [slice(end - G.shape[2], end) for G, end in zip(gradients, ends, strict=True)]
     H = np.zeros((ends[-1], ends[-1]))
     chunks = range(0, len(gradients[0]), RULES.chunk)
-    # So many chunks at a time that there is work for all threads
+    # Take several chunks at a time, so that there is work for all threads
     together = ceil(count_threads() / r)
     for k in range(0, len(chunks), together):
         _add(H, places, chunks[k : k + together], derivatives, gradients, shared)
@@ -388,7 +391,7 @@ def _add(
     gradients: Sequence[Array],
     shared: Shared,
 ) -> None:
-    """Add the products of some chunks: every block by one thread, in the order of the chunks."""
+    """Add the products of some chunks to H. One thread fills each block, in the order of the chunks."""
 
     def rows(piece: tuple[int, int]) -> Array:
         start, j = piece
@@ -407,7 +410,7 @@ def _add(
             for row, other in rows_of[i, j]:
                 H[places[i], places[j]] += X[start, i][:, row].T @ X[start, j][:, other]
 
-    # Rows of samples times gradients first, then squares and mixed products of them, each a block of the matrix
+    # First the rows X_j = D_j G_j of all chunks, then their squares and mixed products, each in its block of H
     r = len(derivatives)
     rows_of: dict[tuple[int, int], list[tuple[int, int]]] = {}
     for i, j, row, other in shared:
@@ -419,32 +422,32 @@ def _add(
     run_in_threads(lambda block: block(), work)
 
 
-# Blocks of samples at a time, so that the memory never holds all of them twice
+# Number of blocks that are converted at a time, so that the memory never holds all of them twice
 _PART = 16
 
 
 class BasisGradients(ABC):
     """d psi / dq of a linear family xi = C psi(q) with K functions of n joints.
 
-    At every sample some numbers X are known, in g groups of S, and J_xi = T X with a table T of coefficients
+    Every sample has numbers X, g groups of S of them, such that J_xi = T X with a table T of coefficients
     (g, n r / g, S) that is linear in C. The rows of T X are the columns of J_xi, one joint after the other. Samples are
     stored in the blocks of `orthocas.tools.columns`, (B, g, S, c) for B blocks of c samples.
 
     Args:
         family: the basis.
         n: number of joints.
-        dtype: type of the numbers X; they are computed in double precision.
+        dtype: type in which the numbers X are stored; they are computed in double precision.
     """
 
     def __init__(self, family: LinearFamily, n: int, dtype: DTypeLike = np.float64) -> None:
         self.family, self.n, self.dtype = family, n, np.dtype(dtype)
 
     def at(self, points: Array) -> Array:
-        """The numbers X at points (N, n), (B, g, S, c)."""
+        """The numbers X (B, g, S, c) at points (N, n)."""
         blocks = arrange_blocks(points)
         if self.dtype == np.float64:
             numbers = self._columns(blocks)[0]
-        else:  # some blocks at a time, so that the memory never holds all of them in double precision
+        else:  # convert some blocks at a time, so that the memory never holds all of them in double precision
             parts = (self._columns(blocks[k : k + _PART])[0] for k in range(0, len(blocks), _PART))
             numbers = np.concatenate([part.astype(self.dtype) for part in parts])
         return numbers.reshape(len(numbers), self.groups, -1, numbers.shape[2])
@@ -456,29 +459,30 @@ class BasisGradients(ABC):
 
     @abstractmethod
     def build_table(self, C: Array) -> Array:
-        """T for coefficients C (r, K), with numbers of the type of X."""
+        """T (g, n r / g, S) for coefficients C (r, K), in the number type of X."""
 
     @abstractmethod
     def collect(self, slopes: Array) -> Array:
-        """dL/dC, (r, K), of a function L with slopes dL/dT."""
+        """dL/dC (r, K) of a function L, from its slopes dL/dT (g, n r / g, S)."""
 
     @abstractmethod
-    def expand_part(
-        self, X: Array, samples: int, kept: NDArray[np.bool_], every: int = 1, dtype: DTypeLike | None = None
+    def expand(
+        self,
+        X: Array,
+        samples: int,
+        kept: NDArray[np.bool_] | None = None,
+        every: int = 1,
+        dtype: DTypeLike | None = None,
     ) -> Array:
-        """Gradients d psi_k / dq_i of some functions at some samples, zeros included, (samples, n, kept).
+        """Gradients d psi_k / dq_i, zeros included, (samples / every, n, functions).
 
         Args:
             X: result of `at`, (B, g, S, c).
             samples: number of samples, without the padding of the last block.
-            kept: the functions, (K,).
+            kept: the functions, (K,). Default: all.
             every: take only every second, third, ... sample, a divisor of c.
             dtype: type of the numbers. Default: that of X.
         """
-
-    def expand(self, X: Array, samples: int) -> Array:
-        """All gradients at all samples, (N, n, K)."""
-        return self.expand_part(X, samples, np.ones(self.family.width, dtype=bool))
 
     def square(self, X: Array, squares: Sequence[Array], kept: NDArray[np.bool_]) -> list[Array]:
         """Sums over samples of G^T W_j G for every coordinate j, with gradients G (n, K_j) of its functions.
@@ -487,12 +491,12 @@ class BasisGradients(ABC):
 
         Args:
             X: numbers at the samples, (B, g, S, c).
-            squares: symmetric W_j at the first of the samples, (N, n, n).
+            squares: symmetric W_j (N, n, n) of every coordinate, at the N samples of X without its padding.
             kept: the functions of every coordinate, (r, K).
         """
         found = []
         for W, own in zip(squares, kept, strict=True):
-            G = self.expand_part(X, len(W), own, dtype=np.float32)
+            G = self.expand(X, len(W), own, dtype=np.float32)
             rows = W.astype(np.float32) @ G
             found.append((G.reshape(-1, G.shape[2]).T @ rows.reshape(-1, G.shape[2])).astype(float))
         return found
@@ -515,7 +519,7 @@ class BasisGradients(ABC):
 
     @abstractmethod
     def _numbers(self, q: ca.SX) -> ca.SX:
-        """X of one sample, group by group."""
+        """The numbers X (g S, 1) of one sample, one group after the other."""
 
     @cached_property
     def _columns(self) -> ColumnFunction:
@@ -527,27 +531,27 @@ class ProductGradients(BasisGradients):
     """X holds the functions psi' of (1, psi) that occur in derivatives: d psi / dq_i = D_i psi', in a single group.
 
     For polynomials of degree d in n joints these are the C(n + d - 1, n) terms up to degree d - 1, where the gradients
-    have n C(n + d - 1, n) entries that are not zero. So X needs an n-th of the memory, and products with it take less
-    time than to read the gradients.
+    have n C(n + d - 1, n) entries that are not zero. So X needs an n-th of the memory, and a product with X takes less
+    time than reading the gradients would.
     """
 
     def __init__(self, family: ProductFamily, n: int, dtype: DTypeLike = np.float64) -> None:
         super().__init__(family, n, dtype)
         matrices = [family.build_derivative_matrix(i)[1:] for i in range(n)]
-        # Places of psi' in (1, psi)
+        # Indices of psi' in (1, psi)
         self._places = np.unique(np.concatenate([D.indices for D in matrices]))
         matrices = [D[:, self._places] for D in matrices]
-        # All D_i, (n K, S)
+        # All D_i below each other, (n K, S)
         self._upright = scipy.sparse.vstack(matrices).tocsr()
-        # All D_i^T, (n S, K)
+        # All D_i^T below each other, (n S, K)
         self._lying = scipy.sparse.vstack([D.T for D in matrices]).tocsr()
         self._back = self._lying.T.tocsr()
-        # Rows of all D_i for some of the functions, so far
+        # Cache: the rows of all D_i for a subset of the functions and a number type
         self._parts: dict[tuple[bytes, str], Any] = {}
 
     @property
     def groups(self) -> int:
-        """One."""
+        """One group holds all numbers."""
         return 1
 
     def build_table(self, C: Array) -> Array:
@@ -556,19 +560,25 @@ class ProductGradients(BasisGradients):
         return np.ascontiguousarray(rows, dtype=self.dtype).reshape(1, self.n * len(C), -1)
 
     def collect(self, slopes: Array) -> Array:
-        """The sum over the joints of dL/dT D_i^T."""
+        """dL/dC = sum_i (dL/dT)_i D_i^T."""
         by_joint = slopes.reshape(self.n, -1, slopes.shape[2]).transpose(0, 2, 1)
         rows: Array = (self._back @ by_joint.reshape(-1, by_joint.shape[2])).T
         return rows
 
-    def expand_part(
-        self, X: Array, samples: int, kept: NDArray[np.bool_], every: int = 1, dtype: DTypeLike | None = None
+    def expand(
+        self,
+        X: Array,
+        samples: int,
+        kept: NDArray[np.bool_] | None = None,
+        every: int = 1,
+        dtype: DTypeLike | None = None,
     ) -> Array:
-        """D_i psi'."""
+        """Gradients as D_i psi'."""
         assert X.shape[3] % every == 0
+        kept = np.ones(self.family.width, dtype=bool) if kept is None else kept
         kind = X.dtype if dtype is None else np.dtype(dtype)
         values = X[:, 0, :, ::every].transpose(1, 0, 2).reshape(X.shape[2], -1)[:, : -(-samples // every)]
-        # The rows of these functions in all D_i, (n kept, S), kept for the next time
+        # Take the rows of these functions from all D_i, (n kept, S), and keep them for the next call
         key = kept.tobytes(), kind.str
         if key not in self._parts:
             self._parts[key] = self._upright[np.tile(kept, self.n)].astype(kind)
@@ -576,13 +586,13 @@ class ProductGradients(BasisGradients):
         return np.ascontiguousarray(dense.T).reshape(dense.shape[1], self.n, int(kept.sum()))
 
     def square(self, X: Array, squares: Sequence[Array], kept: NDArray[np.bool_]) -> list[Array]:
-        """Sums of W_j psi' psi'^T where these are smaller, then D_i on both sides."""
+        """The sums of W_j times psi' psi'^T, with D_i on both sides; or those of gradients where that is less work."""
         n, S = self.n, X.shape[2]
-        # Where terms have several factors, psi' psi'^T has as many entries as products of gradients
+        # If psi' has many functions, psi' psi'^T has more entries than the products of gradients
         if n * (n + 1) // 2 * (S * (S + 1) // 2) >= n * int(kept.sum(axis=1).max()) ** 2:
             return super().square(X, squares, kept)
         values = X[:, 0].transpose(0, 2, 1).reshape(-1, S)[: len(squares[0])].astype(np.float32)
-        # Both factors are symmetric: half of their entries
+        # W and psi' psi'^T are symmetric: their upper triangles are enough
         (i, j), (s, t) = np.triu_indices(n), np.triu_indices(S)
         entries = np.concatenate([W[:, i, j].astype(np.float32).T for W in squares])
         sums, piece = np.zeros((len(entries), len(s)), dtype=np.float32), max(1, RULES.products // len(s))
@@ -600,7 +610,7 @@ class ProductGradients(BasisGradients):
         return found
 
     def differentiate_along(self, X: Array, directions: Array) -> Array:
-        """The sum over the joints of D_i (a_i psi')."""
+        """Derivatives along a as sum_i D_i (a_i psi')."""
         K, N = self.family.width, len(directions)
         values = X[:, 0].transpose(1, 0, 2).reshape(X.shape[2], -1)[:, :N]
         total = np.zeros((K, N))
@@ -615,14 +625,14 @@ class ProductGradients(BasisGradients):
 
 
 class SparseGradients(BasisGradients):
-    """X holds d psi_k / dq_i for the functions that depend on joint i, a group for each joint.
+    """X holds d psi_k / dq_i for the functions that depend on joint i, one group for each joint.
 
-    CasADi's sparsity pattern of the Jacobian lists the entries that are not zero.
+    CasADi's sparsity pattern of the Jacobian tells which functions these are.
     """
 
     @property
     def groups(self) -> int:
-        """One for each joint."""
+        """One group for each joint."""
         return self.n
 
     @cached_property
@@ -636,24 +646,30 @@ class SparseGradients(BasisGradients):
         return np.array([sorted(row) + [-1] * (width - len(row)) for row in rows])
 
     def build_table(self, C: Array) -> Array:
-        """The coefficients of the functions of each joint, (n, r, S)."""
+        """T with the coefficients of the functions that depend on each joint, (n, r, S)."""
         return np.ascontiguousarray(C[:, self.terms_of_joints].transpose(1, 0, 2), dtype=self.dtype)
 
     def collect(self, slopes: Array) -> Array:
-        """The sum over the joints."""
+        """dL/dC: slopes of all joints, added at the places of their functions."""
         total = np.zeros((slopes.shape[1], self.family.width))
         for places, part in zip(self.terms_of_joints, slopes, strict=True):
             used = places >= 0
             total[:, places[used]] += part[:, used]
         return total
 
-    def expand_part(
-        self, X: Array, samples: int, kept: NDArray[np.bool_], every: int = 1, dtype: DTypeLike | None = None
+    def expand(
+        self,
+        X: Array,
+        samples: int,
+        kept: NDArray[np.bool_] | None = None,
+        every: int = 1,
+        dtype: DTypeLike | None = None,
     ) -> Array:
-        """The numbers in their places."""
+        """Gradients with the numbers X in their places, and zeros elsewhere."""
         B, n, _, c = X.shape
         assert c % every == 0
-        # Each joint's numbers, at the places that its functions have among those asked for
+        kept = np.ones(self.family.width, dtype=bool) if kept is None else kept
+        # Put each joint's numbers at the places of its functions among the chosen ones
         place = np.cumsum(kept) - 1
         dense = np.zeros((B, c // every, n, kept.sum()), dtype=X.dtype if dtype is None else dtype)
         for i, functions in enumerate(self.terms_of_joints):
@@ -674,7 +690,7 @@ class SparseGradients(BasisGradients):
 
 
 def build_gradients(family: LinearFamily, n: int, dtype: DTypeLike = np.float64) -> BasisGradients:
-    """Gradients of a family of n joints, with numbers of a type."""
+    """Gradients of a family of n joints, stored as numbers of type `dtype`."""
     return (
         ProductGradients(family, n, dtype) if isinstance(family, ProductFamily) else SparseGradients(family, n, dtype)
     )

@@ -1,4 +1,4 @@
-"""Objectives made of others: weighted sums, parts of the samples, and a bound on the angles between coordinates."""
+"""Objectives made of others: weighted sums, losses on part of the samples, and a bound on mutual angles."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ from orthocas.tools.checks import Array
 class WeightedSum:
     """A sum of losses of the same parameters on several sets of samples, each times a weight.
 
-    Only the first one may draw fresh samples, such as the loss on the domain beside a penalty on its worst points.
+    The first is the loss on the domain, which may draw fresh samples; others are such as a penalty on its worst points.
     """
 
     def __init__(self, parts: Sequence[tuple[float, Objective]]) -> None:
@@ -39,7 +39,7 @@ class WeightedSum:
         return sum(weight * value for weight, value, _ in results), _add((weight, g) for weight, _, g in results)
 
     def batches(self, size: int, count: int, seed: tuple[int, ...]) -> Iterator[Self]:
-        """The first loss on fresh samples, each time with the same others."""
+        """Sums with the first loss on fresh samples, and the others on their own samples."""
         (weight, first), *others = self.parts
         assert isinstance(first, SampledObjective)
         for loss in first.batches(size, count, seed):
@@ -72,11 +72,11 @@ def _add(parts: Iterable[tuple[float, Array]]) -> Array:
 
 
 class Resampled:
-    """A loss of networks on some of its samples. Steps take others, drawn from all.
+    """A loss of networks whose value is taken on some of its samples, and whose steps draw batches from all of them.
 
     Args:
         whole: the loss on all samples.
-        watched: places of the samples on which it is watched.
+        watched: indices of the samples for value and gradient.
         count: number of all samples.
     """
 
@@ -85,18 +85,18 @@ class Resampled:
         self._watched = whole.part(watched)
 
     def value(self, theta: Array) -> float:
-        """The mean over the samples that are watched."""
+        """The mean loss over the watched samples."""
         return self._watched.value(theta)
 
     def value_and_gradient(self, theta: Array) -> tuple[float, Array]:
-        """The mean over the samples that are watched, and its gradient."""
+        """The mean loss over the watched samples, and its gradient."""
         return self._watched.value_and_gradient(theta)
 
     def batches(self, size: int, count: int, seed: tuple[int, ...]) -> Iterator[Objective]:
-        """The mean over `size` samples drawn from all, `count` times."""
+        """`count` losses, each the mean over `size` samples drawn from all."""
         rng, size = np.random.default_rng(seed), min(size, self._count)
         while count > 0:
-            # All samples are gathered once in a random order: parts of them need no copies
+            # Copy the samples once in a random order, so that batches are slices without copies
             shuffled = self._whole.part(rng.permutation(self._count)[: count * size])
             for start in range(0, min(count * size, self._count - size + 1), size):
                 yield shuffled.part(slice(start, start + size))
@@ -106,11 +106,11 @@ class Resampled:
 def bound_mutual_angles(
     objective: BasisObjective, theta: Array, bound: float, r: int, fresh: bool
 ) -> tuple[BoundedMutual, Array]:
-    """The problem with a bound on the mutual angles, and its start.
+    """The objective with a bound on the mutual angles, and its start.
 
     Args:
         objective: the weighted loss.
-        theta: where that would start, (size,).
+        theta: start of the weighted loss, (size,).
         bound: on the root mean square deviation of mutual angles from a right angle [rad].
         r: number of all coordinates, with those of idle joints.
         fresh: whether no stage has been solved before.
@@ -118,9 +118,9 @@ def bound_mutual_angles(
     fitted = len(pairs(objective.r))
     if not fitted:
         raise InvalidValueError("max_mutual_deg", "given", "a problem with two or more coordinates to fit")
-    # Pairs with an idle joint are exactly orthogonal, so the other pairs may use their part
+    # The mean is over all pairs. Those with an idle joint are exactly orthogonal, so the others may deviate more
     bounded = BoundedMutual(objective, bound * (len(pairs(r)) / fitted) ** 0.5)
-    # Solve the weighted problem first: minima far from its own are worse
+    # Start from the minimum of the weighted loss: bounded minima far from it are worse
     if fresh:
         weighted = replace(objective.weights, mutual=DEFAULT_WEIGHTS.mutual)
         theta = GaussNewton().minimise(objective.reweigh(weighted), theta).require_finished().theta
@@ -146,20 +146,20 @@ class BoundedMutual:
     """
 
     def __init__(self, objective: BasisObjective, bound: float) -> None:
-        # The basis is sampled once, and shared by the objectives below
+        # Both objectives share the samples of the basis
         weights, self._gram = objective.weights, objective.gram
         self._task = objective.reweigh(Weights(weights.task, 0.0, weights.regularity, angles=weights.angles))
-        # 2 cancels the factor 1/2 of the loss
+        # The weight 2 cancels the factor 1/2 of the loss
         only_mutual = Weights(0.0, 2.0, 0.0, angles=weights.angles)
         self._mutual = objective.reweigh(only_mutual)
         self._r, self._K, self._bound = objective.r, objective.K, bound
 
     def value(self, theta: Array) -> float:
-        """Task term (and regularity term)."""
+        """Task term, plus the regularity term if it has a weight."""
         return self._task.value(theta)
 
     def value_and_gradient(self, theta: Array) -> tuple[float, Array]:
-        """Task term (and regularity term) and its gradient, (size,)."""
+        """Task term, plus the regularity term if it has a weight, and the gradient, (size,)."""
         return self._task.value_and_gradient(theta)
 
     @property
@@ -169,7 +169,7 @@ class BoundedMutual:
         return np.concatenate([[-np.inf], ones]), np.concatenate([[1.0], ones])
 
     def constraints(self, theta: Array) -> tuple[Array, Array]:
-        """Mutual term over its bound, then the gauge of every coordinate, (1 + r,), and their Jacobian."""
+        """Mutual term over its bound, then E|grad xi_j|^2 of every coordinate, (1 + r,), and their Jacobian."""
         value, gradient = self._mutual.value_and_gradient(theta)
         C = theta.reshape(self._r, self._K)
         raised = C @ self._gram

@@ -75,22 +75,23 @@ def compare(
     If a fit fails, the result says so and the others continue. Coordinates in closed form need no solver and no seed,
     so they are evaluated once.
 
-    With a branch the fits are those of `fit_wide`, each evaluated on its own domain. Several weights then show what
-    less leak costs: regular share of the branch and conditioning, as a front (`plot`) and as a table (`rows`).
+    With a branch the fits are those of `fit_wide`, each evaluated on its own domain. With several weights, the figure
+    (`plot`) and the table (`rows`) show how regular share and conditioning fall as leaks become smaller.
 
-    In scripts, call it under `if __name__ == "__main__"`: it starts processes.
+    In scripts, call it under `if __name__ == "__main__"`, because it starts processes.
 
     Args:
-        problem: robot, task, metric and domain. A branch takes the place of the domain.
-        parametrisations: the parametrisations to fit, or their words of the command line, such as "polynomial:4".
-        solvers: the solvers to use. Default: for each parametrisation the default of `fit`. Wide fits have their own.
-        branch: fit wide charts of it; a branch of `orthocas.branches`, its name, or a box, as in `fit_wide`.
+        problem: robot, task, metric and domain. A branch replaces the domain.
+        parametrisations: the parametrisations to fit, or their names on the command line, such as "polynomial:4".
+        solvers: the solvers to use. Default: for each parametrisation the default of `fit`. Not for wide fits.
+        branch: the branch for wide fits: one of `orthocas.branches`, its name, or a box, as in `fit_wide`.
         seeds: number of seeds 0, 1, ... of samples and random starts.
-        weights: weights of the loss, or several of them; see `fit`, and `fit_wide` for a branch: there 2 m a weighs
-            leaks a times as much as the default. Default: those of these functions.
-        like: what coordinates are like, as in `fit` and `fit_wide`; wide ones are fitted to it, not taken exactly.
-            Processes take names, tasks and functions of modules.
-        clearance: of wide fits, see `fit_wide`. Default: that of the problem's domain, or of `fit_wide`.
+        weights: weights of the loss, or several of them; see `fit`, and `fit_wide` for a branch. Default: those of
+            these functions.
+        like: quantities to follow, as in `fit` and `fit_wide`; wide charts follow them too, and do not take them
+            exactly. For processes it must be a name, a task, or a function of a module.
+        clearance: least relative singular value in wide fits, see `fit_wide`. Default: that of the problem's domain, or
+            of `fit_wide`.
         samples: number of training samples. Default: grows with the number of parameters.
         held_out: number of held-out samples.
         executor: any `concurrent.futures.Executor` (processes, threads, Dask, MPI, ...). Default: processes on this
@@ -100,11 +101,11 @@ def compare(
         control_ticks: measure after all fits how long a control tick takes with each parametrisation. The tick is
             decoupled PD+ as generated C, on a saved chart. NaN if there is no C compiler.
         monitor: called with progress.
-        force: replace files in the folder for charts that are no charts.
+        force: replace files with the names of charts in that folder even if they are no charts.
 
     Raises:
-        InvalidValueError: if the grid is empty, two of its parametrisations, solvers or weights are the same, or there
-            are solvers for wide fits.
+        InvalidValueError: if the grid is empty, if two of its parametrisations, solvers or weights have the same name,
+            or if solvers are given for wide fits.
         UnknownNameError: if there is no such branch.
         ChartFileError: if the folder for charts cannot be written, or has another file with the name of a chart.
         Interrupted: after Ctrl-C; its `result` is the comparison of the finished fits.
@@ -131,9 +132,11 @@ def compare(
     families = _check_grid(parametrisations, solvers)
     part = branches(problem.robot, problem.task)[branch] if isinstance(branch, str) else branch
     if part is not None and solvers is not None:
-        raise InvalidValueError("solvers", "given with a branch", "no solvers: wide fits have their own")
+        raise InvalidValueError("solvers", "given with a branch", "no solvers, because wide fits choose their own")
     if clearance is not None and part is None:
-        raise InvalidValueError("clearance", "given without a branch", "a branch: it is of wide fits")
+        raise InvalidValueError(
+            "clearance", "given without a branch", "a branch, because only wide fits have a clearance"
+        )
     bound = problem.domain.singular_bound
     if clearance is None:
         clearance = CLEARANCE if bound is None else bound.least_singular_value
@@ -149,7 +152,7 @@ def compare(
     first = Cell(problem, families[0], None, 0, losses[0], samples, held_out, None, force, part, like, clearance)
     cells = _build_cells(first, families, solvers, losses, seeds, folder)
 
-    # Results arrive in any order, and return in that of the grid.
+    # Results arrive in any order: sort them by the order of the grid.
     order = {cell.names: k for k, cell in enumerate(cells)}
     results: list[CellResult] = []
     interrupted = False
@@ -169,17 +172,21 @@ def compare(
 def _list_weights(
     weights: Weights | WeightNumbers | Sequence[Weights | WeightNumbers] | None, default: Weights | None
 ) -> list[Weights | None]:
-    """The weights of a grid, one or several."""
+    """The weights of a grid, as a list.
+
+    Raises:
+        InvalidValueError: if two of them have the same label.
+    """
     if weights is None:
         return [default]
-    # One set of weights may be numbers or an object
+    # A single set of weights is an object or a list of numbers
     if isinstance(weights, Weights) or not any(isinstance(each, Weights | Sequence) for each in weights):
         return [Weights.of(cast(Weights | WeightNumbers, weights))]
-    # Several are told apart by their labels
+    # Tables distinguish several sets by their labels
     several = [Weights.of(cast(Weights | WeightNumbers, each)) for each in weights]
     labels = [each.label for each in several]
     if twice := [label for label in labels if labels.count(label) > 1]:
-        raise InvalidValueError("weights", f"a list with {twice[0]} twice", "different ones")
+        raise InvalidValueError("weights", f"a list with {twice[0]} twice", "weights that all differ")
     return list(several)
 
 
@@ -191,19 +198,19 @@ def _build_cells(
     seeds: int,
     folder: Path | None,
 ) -> list[Cell]:
-    """The cells of a grid, with all else like the first one. Coordinates in closed form need neither solver nor seed.
+    """The cells of a grid; settings that do not vary are those of the first one.
 
     Raises:
         ChartFileError: if a file has the name of a chart, and is not to be replaced.
     """
     cells = []
     for parametrisation in parametrisations:
-        # Closed forms have one fit for all solvers, weights and seeds
+        # Coordinates in closed form have a single cell, because they need no solver, weights or seed
         closed = parametrisation.closed_form is not None
         fitting = [choose_solver(parametrisation, first.problem)] if closed or solvers is None else solvers
         for solver, loss, seed in product(fitting, losses[:1] if closed else losses, range(1 if closed else seeds)):
             cell = replace(first, parametrisation=parametrisation, solver=solver, weights=loss, seed=seed)
-            # A chart file for each cell, refused before the first fit if it exists
+            # Name the chart file of the cell, and refuse names of other files before the first fit
             if folder is not None:
                 words = [parametrisation.label, solver.name if first.branch is None else WIDE, str(seed)]
                 words += [cell.weights_label] if len(losses) > 1 else []
@@ -217,11 +224,15 @@ def _build_cells(
 def _check_grid(
     parametrisations: Sequence[Parametrisation | str], solvers: Sequence[Solver] | None
 ) -> list[Parametrisation]:
-    """Refuse grids that are empty, contain other objects, or have two entries of the same name; words are read."""
+    """The parametrisations of a grid as objects.
+
+    Raises:
+        InvalidValueError: if parametrisations or solvers are none, of another type, or two of the same name.
+    """
     families: Any = parametrisations
     if isinstance(parametrisations, list | tuple):
         families = [parse_parametrisation(one) if isinstance(one, str) else one for one in parametrisations]
-    # Members of the right kind, and names that differ: tables and files go by them
+    # Names must differ, because tables and files identify fits by them
     for name, members, kinds, example in (
         ("parametrisations", families, Parametrisation, "Polynomial(degree=4)"),
         ("solvers", [GaussNewton()] if solvers is None else solvers, Solver, "GaussNewton()"),
@@ -247,37 +258,37 @@ class Cell:
 
     problem: Problem
     parametrisation: Parametrisation
-    solver: Solver | None  #: None for the default, and for wide fits
+    solver: Solver | None  #: None in the template from which cells are made
     seed: int
-    weights: Weights | None  #: None for those of a wide fit
+    weights: Weights | None  #: None for the default of `fit_wide`
     samples: int | None
     held_out: int
     chart_file: Path | None  #: file to save the chart in
     force: bool = False  #: replace a file there that is not a chart
     branch: Branch | Box | None = None  #: of a wide fit
-    like: Likeness | None = None  #: what coordinates are like
+    like: Likeness | None = None  #: quantities that coordinates follow
     clearance: float = CLEARANCE  #: of a wide fit
 
     @property
     def solver_name(self) -> str:
-        """Name of the solver. Coordinates in closed form need none."""
+        """Name of the solver; "wide" for wide fits, and "closed form" for coordinates that need none."""
         if self.branch is not None:
             return WIDE
         assert self.solver is not None
         return self.solver.name if self.parametrisation.closed_form is None else "closed form"
 
     def fail(self, error: str) -> CellResult:
-        """The result if the fit failed."""
+        """The result of a cell whose fit failed with this error."""
         return CellResult(*self.names, Status.FAILED.value, " ".join(error.split()))
 
     @property
     def weights_label(self) -> str:
-        """The weights as commands take them; empty for those of a wide fit."""
+        """The weights as written on the command line; empty for the default of `fit_wide`."""
         return "" if self.weights is None else self.weights.label
 
     @property
     def names(self) -> tuple[str, str, str, str, int]:
-        """What tells a cell from others: problem, parametrisation, solver, weights, seed."""
+        """What identifies a cell: problem, parametrisation, solver, weights, seed."""
         return self.problem.name, self.parametrisation.label, self.solver_name, self.weights_label, self.seed
 
     def fit(self, monitor: Monitor) -> Fit:
@@ -297,16 +308,16 @@ class Cell:
 
 @dataclass(frozen=True)
 class CellResult:
-    """The result of one fit, or its error. The numbers of a failed fit are NaN."""
+    """The result of one fit, or its error. Measured values of a failed fit are NaN, and counts are 0."""
 
     problem: str
     parametrisation: str
     solver: str
-    weights: str  #: as commands take them; empty for those of wide fits
+    weights: str  #: as written on the command line; empty for the default of wide fits
     seed: int
     status: str
     error: str = ""
-    seconds: float = float("nan")  #: duration of the fit
+    seconds: float = float("nan")  #: duration of the fit [s]
     parameters: int = 0
     samples: int = 0
     iterations: int = 0
@@ -319,13 +330,13 @@ class CellResult:
     conditioning_mean: float = float("nan")
     folded_samples: int = 0
     regular_share: float = float("nan")  #: of the branch, for wide fits
-    control_tick_us: float = float("nan")  #: a tick of decoupled PD+ as generated C; NaN if not measured
+    control_tick_us: float = float("nan")  #: a tick of decoupled PD+ as generated C [us]; NaN if not measured
     #: seconds since the start of the fit, and training loss, in its last stage
     history: tuple[tuple[float, float], ...] = ()
 
     @property
     def names(self) -> tuple[str, str, str, str, int]:
-        """Names of its cell."""
+        """Names of the cell."""
         return self.problem, self.parametrisation, self.solver, self.weights, self.seed
 
     @property
@@ -339,7 +350,7 @@ def run_cell(cell: Cell) -> CellResult:
     history: list[tuple[float, float]] = []
     stages: list[str] = []
     start = time.perf_counter()
-    # Losses over time, of the last stage only
+    # Keep the losses over time of the last stage only
 
     def record(progress: Progress) -> None:
         if progress.stage not in stages:
@@ -348,7 +359,7 @@ def run_cell(cell: Cell) -> CellResult:
         if math.isfinite(progress.value):
             history.append((time.perf_counter() - start, progress.value))
 
-    # A failure of any kind is a result of its cell, and leaves the others alone
+    # Any failure becomes the result of this cell, so that the other cells continue
     try:
         result = cell.fit(record)
         if cell.chart_file is not None:
@@ -412,7 +423,7 @@ def _run_in_processes(cells: Sequence[Cell], size: int) -> Iterator[CellResult]:
     with open_draft_folder() as folder, Processes(size, begin_worker, os.getpid()) as processes:
         queue, running = iter(enumerate(cells)), dict[Future[CellResult], Cell]()
         while True:
-            # No process has more than one cell, so one that dies loses no other.
+            # Give each process one cell at a time, so that a process that dies loses only that cell.
             while len(running) < size and (entry := next(queue, None)) is not None:
                 k, cell = entry
                 try:
@@ -471,7 +482,7 @@ def measure_control_ticks(results: Sequence[CellResult], cells: Sequence[Cell], 
 
 @dataclass(frozen=True)
 class Summary:
-    """One parametrisation, solver and weights over all seeds: medians, and the relative spread of both angles."""
+    """Results of one parametrisation, solver and weights: medians over seeds, and relative spreads of both angles."""
 
     parametrisation: str
     solver: str
@@ -480,14 +491,14 @@ class Summary:
     failed: int
     error: str  #: error of the first failed seed
     parameters: int
-    seconds: float
+    seconds: float  #: duration of the fit [s]
     task_std_deg: float
     mutual_std_deg: float
     leak_rms_deg: float  #: in the metric; the two above are the paper's
     conditioning_p01: float
     regular_share: float  #: of the branch, for wide fits
     folded_samples: int
-    control_tick_us: float  #: duration of a decoupled PD+ tick as generated C
+    control_tick_us: float  #: duration of a decoupled PD+ tick as generated C [us]
     task_spread: float  #: (largest - smallest) / median
     mutual_spread: float
 
@@ -501,11 +512,14 @@ class Comparison(Shown):
 
     @property
     def wide(self) -> bool:
-        """Whether the fits are wide ones."""
+        """Whether the fits are wide fits."""
         return any(result.solver == WIDE for result in self.results)
 
     def summaries(self) -> list[Summary]:
-        """One for each parametrisation, solver and weights: best task angle (wide: leak) first, failures last."""
+        """One summary for each parametrisation, solver and weights.
+
+        The least task angle comes first (of wide fits the least leak), and failures come last.
+        """
         groups: dict[tuple[str, str, str], list[CellResult]] = {}
         for result in self.results:
             groups.setdefault((result.parametrisation, result.solver, result.weights), []).append(result)
@@ -516,12 +530,12 @@ class Comparison(Shown):
     def write(self, folder: Path, force: bool = False) -> None:
         """Write comparison.csv (one line per fit) and comparison.json (with histories).
 
-        They replace files of these names that orthocas wrote there, and with `force` any others.
+        Files of these names are replaced if orthocas wrote them, and with `force` in any case.
 
         Raises:
-            ArchiveError: if there are others, or symbolic links.
+            ArchiveError: if there are other files of these names, or symbolic links.
         """
-        # The table for programs that read CSV, and everything as JSON
+        # CSV has the table of the fits, JSON has everything
         names = [field.name for field in fields(CellResult) if field.name != "history"]
         text = io.StringIO(newline="")
         writer = csv.DictWriter(text, names)
@@ -549,7 +563,7 @@ class Comparison(Shown):
         }
 
     def plot(self) -> Figure:
-        """Angles of all fits, or leaks over what they cost, as a figure; see `comparison_figures.front_figure`."""
+        """Figure of the angles of all fits or, of wide fits, their leaks; see `comparison_figures.front_figure`."""
         from orthocas.fitting.comparison_figures import front_figure  # with matplotlib, which takes long to import
 
         return front_figure(self)
@@ -589,7 +603,7 @@ def summarise(results: Sequence[CellResult]) -> Summary:
     """Medians over the seeds of one parametrisation, solver and weights."""
     good = [result for result in results if not result.failed]
     first = (good or results)[0]
-    # Medians of the seeds that worked, and how far these lie apart
+    # Medians and spreads are over the seeds that did not fail
 
     def compute_median(name: str) -> float:
         return median(float(getattr(result, name)) for result in good) if good else math.nan
@@ -624,14 +638,14 @@ def _describe(s: Summary) -> str:
 
 
 def _row(s: Summary) -> dict[str, str]:
-    """The cells of a row by their columns; the last one of a short row may be long."""
-    # Failed seeds are counted beside the solver; if all failed, the row ends with the reason
+    """The cells of a row by their columns. A row whose seeds all failed ends with the reason."""
+    # If some seeds failed, their number stands after the solver
     failed = f" ({s.failed} of {s.seeds} failed)" if 0 < s.failed < s.seeds else ""
     names = {"parametrisation": s.parametrisation, "solver": s.solver + failed, "weights": s.weights}
     if s.failed == s.seeds:
         return {**names, "error": f"failed: {s.error}"}
     several = s.seeds - s.failed > 1
-    # Values with their spread over seeds
+    # With several seeds, angles are shown with half of their spread
 
     def angle(value: float, spread: float) -> str:
         if math.isnan(value):

@@ -31,8 +31,8 @@ def front_figure(comparison: "Comparison") -> Figure:
     both directions (medians over seeds). With one extra coordinate there is no mutual angle, so the axis shows the 1 %
     quantile of the conditioning.
 
-    Wide fits are shown by their leak against what it costs: the part of the branch where coordinates are not regular,
-    and the conditioning. Lines connect the weights of one parametrisation, which stand at the points.
+    For wide fits, two plots show the part of the branch where coordinates are not regular, and the conditioning, over
+    the leak. Lines connect the fits of one parametrisation with several weights, which stand at the points.
     """
     if comparison.wide:
         return _wide_front_figure(comparison)
@@ -73,7 +73,7 @@ def front_figure(comparison: "Comparison") -> Figure:
 
 
 def _wide_front_figure(comparison: "Comparison") -> Figure:
-    """The leak of wide fits against what of the branch they leave out, above, and their conditioning, below."""
+    """Two plots over the leak of wide fits: the part of the branch that is not regular, and the conditioning."""
     figure = Picture(figsize=(8.6, 5.2), layout="constrained")
     upper, lower = figure.subplots(2, 1, sharex=True)
     summaries = [summary for summary in comparison.summaries() if summary.failed < summary.seeds]
@@ -111,7 +111,7 @@ def convergence_figure(comparison: "Comparison") -> Figure:
         axes.plot(seconds[-1], loss[-1], ".", color=colour)
     axes.set_xscale("log")
     axes.set_yscale("log")
-    # How networks fall from their random starts is of no interest.
+    # Cut off the high losses at the random starts of networks.
     if drawn:
         axes.set_ylim(top=_ROOM * max(result.history[-1][1] for result in drawn))
     axes.set_xlabel("time [s]")
@@ -146,7 +146,7 @@ def _colours(results: "Sequence[CellResult]") -> dict[str, Colour]:
 
 
 def _place(summary: "Summary", single: bool) -> tuple[float, float]:
-    """Where a summary lies in the picture."""
+    """Coordinates (x, y) of a summary in the plot."""
     return summary.task_std_deg, summary.conditioning_p01 if single else summary.mutual_std_deg
 
 
@@ -155,8 +155,8 @@ def _key(summary: "Summary") -> tuple[str, str, str]:
 
 
 def _label(axes: Axes, summaries: "Sequence[Summary]", single: bool, colours: Mapping[str, Colour]) -> None:
-    """Write each parametrisation once, beside its least task angle; labels that would touch move up or down."""
-    # Summaries come with the least task angle first
+    """Write each parametrisation once, beside its least task angle. Labels that would overlap move up or down."""
+    # Summaries are sorted by their task angle, so the first one of a parametrisation is its best
     best: dict[str, Summary] = {}
     for summary in summaries:
         best.setdefault(summary.parametrisation, summary)
@@ -164,17 +164,20 @@ def _label(axes: Axes, summaries: "Sequence[Summary]", single: bool, colours: Ma
     axes.figure.draw_without_rendering()  # type: ignore[union-attr]  # so that places in points are known
     scale = 72 / axes.figure.dpi
     points = {_key(s): scale * axes.transData.transform(_place(s, single)) for s in summaries}
-    # Left, right and height of what is there.
+    # Left end, right end and height of the points and, later, of labels [pt].
     boxes = [(x - _HIGH / 2, x + _HIGH / 2, y) for x, y in points.values()]
     frame = axes.get_window_extent()
     low, high, end = scale * frame.y0 + _HIGH / 2, scale * frame.y1 - _HIGH / 2, scale * frame.x1
     for name, summary in sorted(best.items(), key=lambda entry: points[_key(entry[1])][1]):
-        # On the right if there is room, at a height where nothing else is
+        # The label is to the right of the point if there is room, at a free height
         x, y = points[_key(summary)]
         wide = _LETTER * len(name)
         side = 1 if x + _ASIDE + wide < end else -1
         left, right = sorted((x + side * _ASIDE, x + side * (_ASIDE + wide)))
-        height = _free_height(y, low, high, [box[2] for box in boxes if left < box[1] and box[0] < right])
+        taken = [box[2] for box in boxes if left < box[1] and box[0] < right]
+        nearest = (height for shift in range(round(high - low)) for height in (y + shift, y - shift))
+        free = (own for own in nearest if low <= own <= high and all(abs(own - other) >= _HIGH for other in taken))
+        height = next(free, y)
         boxes.append((left, right, height))
         axes.annotate(
             name,
@@ -187,15 +190,6 @@ def _label(axes: Axes, summaries: "Sequence[Summary]", single: bool, colours: Ma
             verticalalignment="center",
             arrowprops={"arrowstyle": "-", "color": colours[name], "linewidth": 0.7, "relpos": (side < 0, 0.5)},
         )
-
-
-def _free_height(y: float, low: float, high: float, taken: Sequence[float]) -> float:
-    """The height nearest to y, from low to high, that keeps its distance from taken ones; y if there is none."""
-    for shift in range(round(high - low)):
-        for height in (y + shift, y - shift):
-            if low <= height <= high and all(abs(height - other) >= _HIGH for other in taken):
-                return height
-    return y
 
 
 def _scale(axes: Axes, *values: Sequence[float]) -> None:

@@ -55,8 +55,9 @@ def distil(
     """Fit a closed expression to the values and gradients of a grown chart, for controllers and generated C.
 
     Minimises the mean of |xi - xi_grown|^2 + w^2 |J_xi - J_grown|^2 over samples of the domain, where w is the mean
-    half-width of the domain. Bases that are linear in their parameters use least squares, networks use a minimiser.
-    With `Circle` pairs, it fits cos xi and sin xi of a closed leaf instead, which are smooth across its cut.
+    half-width of the domain. Families that are linear in their parameters are fitted by least squares, networks by a
+    minimiser. With `Circle` pairs, it fits cos xi and sin xi, for coordinates that are angles along closed curves:
+    these functions are smooth where the angle jumps.
 
     Args:
         chart: a grown chart.
@@ -87,9 +88,9 @@ def distil(
     parametrisation = Polynomial(RULES.degree) if parametrisation is None else parametrisation
     if not isinstance(parametrisation, Parametrisation) or parametrisation.closed_form is not None:
         raise InvalidValueError(
-            "parametrisation", repr(parametrisation), "a parametrisation that can be fitted, such as Polynomial(6)"
+            "parametrisation", repr(parametrisation), "a family with parameters to fit, such as Polynomial(6)"
         )
-    # The family: circle-valued ones are fitted by cosine and sine
+    # Circle-valued coordinates are fitted by the family of their cosines and sines
     require_kind("chart", chart, Chart)
     watch = Watch(monitor, f"distil {parametrisation.label}")
     if not isinstance(chart.coordinates, GrownCoordinates):
@@ -98,7 +99,9 @@ def distil(
     whole = parametrisation.family(space, chart.r)
     circle = whole if isinstance(whole, CircleFamily) else None
     if circle is not None and not chart.parts.turns.any():
-        raise InvalidValueError("parametrisation", parametrisation.label, "one that is not circle-valued for this leaf")
+        raise InvalidValueError(
+            "parametrisation", parametrisation.label, "another one, because no coordinate of the chart is an angle"
+        )
     family = whole if circle is None else circle.pairs
     if isinstance(family, LinearFamily):
         if solver is not None:
@@ -108,24 +111,25 @@ def distil(
     default = int(np.clip(RULES.per_parameter * family.size // chart.r, RULES.least_samples, RULES.most_samples))
     count = default if samples is None else require_count("samples", samples)
     if count * (1 + chart.n) <= family.size / chart.r:
-        raise InvalidValueError("samples", count, f"enough for the {family.size // chart.r} parameters of a coordinate")
+        enough = f"more, for the {family.size // chart.r} parameters of a coordinate"
+        raise InvalidValueError("samples", count, enough)
     require_memory(f"distilling with {count} samples", 8.0 * count * chart.n * (chart.n + 4))
-    # Values and gradients of the grown chart at the samples that have them
+    # Take values and gradients of the grown chart at the samples where it has them
     points = sample_evenly(chart.problem.domain, count, require_count("seed", seed, least=0))
     targets = _sample_targets(chart, points)
     own_targets = targets
     if circle is not None:
-        # Cosines, then sines of angles, and their gradients
+        # The targets are the cosines, then the sines of the angles, and their gradients
         c, s, g = np.cos(targets.xi), np.sin(targets.xi), targets.gradients
         gradients = np.concatenate([-s[:, :, None] * g, c[:, :, None] * g], axis=1)
         own_targets = replace(targets, xi=np.concatenate([c, s], axis=1), gradients=gradients)
-    # Bases by least squares, networks by a minimiser
+    # Fit bases by least squares, and networks by a minimiser
     if isinstance(family, LinearFamily):
         theta, offset = _solve_least_squares(family, own_targets, watch)
     else:
         minimiser = LBFGS(max_iterations=500, tolerance=1e-9) if solver is None else solver
         result = minimiser.minimise(_Distance(family, own_targets), family.initial(seed), watch).require_finished()
-        # The output bias of a network includes the offset
+        # The output bias of a network serves as the offset
         theta, offset = result.theta, np.zeros(family.outputs)
     if circle is not None:
         theta, offset = np.concatenate([theta, -offset[: circle.constants]]), np.zeros(chart.r)
@@ -141,13 +145,13 @@ class Distilled(Shown):
 
     chart: Chart
     value_rms: Array  #: root mean square of xi - xi_grown over held-out samples, (r,)
-    gradient_rms: Array  #: of |dxi - dxi_grown| / |dxi_grown|, (r,)
+    gradient_rms: Array  #: root mean square of |dxi - dxi_grown| / |dxi_grown|, (r,)
     grown: Report  #: quality of the grown chart
     distilled: Report  #: quality of the fitted chart; the task angle of the grown chart is exactly 90 degrees
     left_out: float  #: share of training samples where the grown chart has no value
 
     def facts(self) -> dict[str, str]:
-        """What `str` shows: the fitted parametrisation, and its errors of values and gradients on held-out samples."""
+        """The fitted parametrisation, and its errors in values and gradients on held-out samples."""
         before, after = self.grown.task_angle, self.distilled.task_angle
         return {
             "distilled": f"{self.chart.coordinates.label} for {self.chart.notes['distilled from']} coordinates",
@@ -180,13 +184,13 @@ def _sample_targets(chart: Chart, points: Array) -> _Targets:
 
 
 def _evaluate(chart: Chart, distilled: Chart, targets: _Targets, count: int) -> Distilled:
-    # Fresh samples that the fit has not seen
+    # Measure errors on samples that the fit has not seen
     held_out = sample_uniform(chart.problem.domain, min(count, RULES.held_out), RULES.held_out_seed)
     held_out_targets = _sample_targets(chart, held_out)
     errors = wrap_shortest(
         distilled.coordinates.xi(held_out_targets.points) - held_out_targets.xi, distilled.parts.turns[chart.m :]
     )
-    # Angles between gradients, as lengths of differences over the lengths
+    # Relative errors of the gradients
     gradients = held_out_targets.gradients / held_out_targets.weight
     turned = np.linalg.norm(distilled.coordinates.jacobian(held_out_targets.points) - gradients, axis=2)
     relative = turned / np.linalg.norm(gradients, axis=2)
@@ -202,12 +206,12 @@ def _evaluate(chart: Chart, distilled: Chart, targets: _Targets, count: int) -> 
 
 def _solve_least_squares(family: LinearFamily, targets: _Targets, watch: Watch) -> tuple[Array, Array]:
     """Coefficients and offset of the best linear combination, by normal equations over chunks of samples."""
-    # Values and gradients of the basis at a sample, with a column for the constant
+    # A function for values and gradients of the basis
     n, K = targets.points.shape[1], family.width
     q = ca.SX.sym("q", n)
     basis = family.basis(q)
     both = Batched(dense_function("basis", [q], [basis, ca.jacobian(basis, q)]))
-    # Normal equations, summed up part by part so that no part fills the memory
+    # Sum up the normal equations over parts of the samples, to limit the memory. The last column is the offset
     normal, right = np.zeros((K + 1, K + 1)), np.zeros((K + 1, family.outputs))
     for start in range(0, len(targets.points), RULES.chunk):
         part = slice(start, start + RULES.chunk)
@@ -229,7 +233,7 @@ class _Distance:
     def __init__(self, family: Family, targets: _Targets) -> None:
         N, n = targets.points.shape
         r = family.outputs
-        # The mean square distance of values and weighted gradients, and its gradient after theta
+        # The distance as a graph of theta, and its gradient with respect to theta
         theta, q = ca.MX.sym("theta", family.size), ca.MX.sym("q", n, N)
         values, slopes = ca.MX.sym("values", r, N), ca.MX.sym("slopes", r * n, N)
         gradients = ca.vertcat(*family.jacobian(q, theta)) * targets.weight
@@ -238,7 +242,7 @@ class _Distance:
         gradient = ca.jtimes(distance, theta, ca.MX(1), True)
         self._value = NumpyGraph("distance", inputs, [distance])
         self._both = NumpyGraph("distance_and_gradient", inputs, [distance, ca.densify(gradient)])
-        # The data of the samples, as NumPy's products take them
+        # The data of the samples, with one sample in a row
         self._data = [np.ascontiguousarray(part) for part in (targets.points, targets.xi, targets.gradients)]
         self._data[2] = self._data[2].reshape(N, r * n)
 
@@ -247,7 +251,7 @@ class _Distance:
         return float(self._run(self._value, theta)[0][0, 0])
 
     def value_and_gradient(self, theta: Array) -> tuple[float, Array]:
-        """Distance and its gradient, (size,)."""
+        """The distance and its gradient, (size,)."""
         value, gradient = self._run(self._both, theta)
         return float(value[0, 0]), gradient[0]
 

@@ -1,4 +1,4 @@
-"""`fit`: fits coordinates to a problem, along stages, and fixes what the loss leaves free."""
+"""`fit`: fits coordinates to a problem in stages, and fixes their zero, scale, order and signs."""
 
 from __future__ import annotations
 
@@ -102,20 +102,20 @@ def fit(
             at least 1e-6. With a bound, Ipopt minimises the task term, and lambda2 is not used.
         align_to: a chart of the same robot that defines order and signs of the coordinates, for a refit. By default,
             coordinates that move the first joints come first, and each moves its main joint in the positive direction.
-        threads: threads that share the work; bases and networks (`MLP`) do not depend on their number. Default:
-            OMP_NUM_THREADS, or the number of cores.
+        threads: number of threads that share the work. Results of bases and networks (`MLP`) do not depend on it.
+            Default: OMP_NUM_THREADS, or the number of cores.
         split_idle: whether joints that do not affect the task become coordinates themselves. The paper's network learns
             them; False is for comparisons with it.
-        precision: 'double', or 'single' for the large products of loss and gradient: those of a network, and those with
-            the gradients of a basis, which then take half of the memory. Losses and angles change by less than 1e-5 of
-            their size at the same parameters. Parameters and charts are double.
+        precision: 'double' or 'single'. 'single' computes the large products of loss and gradient in single precision:
+            those of a network, and those with the gradients of a basis, which then take half of the memory. At the same
+            parameters, losses and angles change by less than 1e-5 of their size. Parameters and charts are double.
         like: quantities that the first coordinates follow as far as they can be orthogonal to the task: a joint's name,
-            "swivel", a function of an SX column q, several of these, or a task of lower priority, whose missing
-            reference orientation is taken at the centre of the domain. Each has the units of its quantity, and its
-            value there.
+            "swivel", a function of an SX column q, several of these, or a task of lower priority. If that task lacks a
+            reference orientation, the one at the centre of the domain is taken. Each coordinate has the units of its
+            quantity, and the same value at the centre.
 
     Returns:
-        The chart, the result of each stage, and the seconds.
+        The chart, the result of each stage, and the time taken [s].
 
     Raises:
         SingularTaskError, MetricError: if the problem does not pass its own check.
@@ -133,13 +133,13 @@ def fit(
         >>> fit.chart.xi([0.6, 0.8, 0.8]).shape
         (1,)
     """
-    # A robot and its task make a problem; after a problem, the parametrisation has the second place
+    # `fit(robot, task, ...)` builds the problem; in `fit(problem, parametrisation)` the family is the second argument
     if isinstance(problem, Robot):
         of_robot: Any = task
         problem = Problem(problem, of_robot, metric, domain)
     elif task is not None:
         if parametrisation is not None or isinstance(task, Task):
-            raise InvalidValueError("task", repr(task)[:80], "none beside a problem, which has one")
+            raise InvalidValueError("task", repr(task)[:80], "no task or second family: the problem has a task")
         parametrisation = task
     settings = FitSettings.check(
         problem, parametrisation, solver, weights, samples, seed, max_mutual_deg, split_idle, precision, like
@@ -158,7 +158,7 @@ def fit_from(
     seed: int,
     monitor: Monitor,
 ) -> Fit:
-    """The fit of `fit`, from known coordinates if there are some."""
+    """Like `fit`, but starts from the parameters that `begin` gives, if it gives some."""
     settings = FitSettings.check(problem, parametrisation, None, weights, None, seed, None)
     return _fit(problem, settings, monitor, begin=begin)
 
@@ -170,9 +170,9 @@ def _fit(
     align_to: Chart | None = None,
     begin: Begin | None = None,
 ) -> Fit:
-    """Fit with settings that are checked."""
+    """Fit with settings that have been checked."""
     start = time.perf_counter()
-    # The domain that the family asks for, and whether the task can be regular there
+    # Families with cyclic joints or a mobile base widen the domain. Fitted families do not depend on a floating base
     parametrisation = settings.parametrisation
     warn_unless_savable(parametrisation)
     if isinstance(parametrisation, CyclicParametrisation) and parametrisation.cyclic:
@@ -196,7 +196,7 @@ def _fit(
         else:
             singular = problem_check.singular_samples > 0
             solution, coordinates = _solve(problem, settings, monitor, samples, align_to, begin, singular)
-        # The chart, with what a reader of the fit asks first: idle joints, worst points, a smaller domain
+        # The chart, and facts about it: idle joints, worst points, and a smaller domain if the fit suggests one
         joints = [i for i in coordinates.idle if i not in problem.robot.tree.floating]
         result = Fit(
             chart=Chart(problem, coordinates, _write_notes(solution, settings)),
@@ -222,20 +222,20 @@ def _solve(
     begin: Begin | None,
     singular: bool,
 ) -> tuple[Solution, Coordinates]:
-    """Run the stages, and choose scale, order and signs. Joints that the task does not feel become coordinates."""
+    """Run the stages, and choose scale, order and signs. Joints that do not affect the task become coordinates."""
     idle = tuple(find_idle_joints(problem, samples)[-problem.r :]) if settings.split_idle else ()
     space, r = JointSpace.of(problem), problem.r - len(idle)
     if r == 0:
         none = np.zeros(0)
         coordinates = Coordinates(settings.parametrisation, space, idle, none, none, none)
         return Solution((), settings.parametrisation, None), coordinates
-    # Coordinates are fitted in the joints that move the task; quantities to follow are one more term of the loss
+    # The other coordinates depend on the joints that move the task. Quantities to follow add a term to the loss
     active = [i for i in range(problem.n) if i not in idle]
     like = None if settings.like is None else settings.like.build_term(problem, active)
     settings = settings if like is None else settings.add_term(like)
     folds = FoldSearch(problem, active, settings.fold_weight(problem), singular)
     solution = Continuation(problem, settings, active, monitor, folds, like, begin).run()
-    # Angles leave free where xi is zero, how long its gradient is, the order and the signs
+    # The loss does not determine where xi is zero, how long its gradient is, the order and the signs
     raw = Coordinates(solution.parametrisation, space, idle, solution.theta, np.zeros(r), np.ones(r))
     coordinates = normalise(raw, problem.domain.home, samples)
     if settings.like is not None:
@@ -252,7 +252,7 @@ def normalise(raw: Coordinates, origin: Array, samples: Samples) -> Coordinates:
         OrthocasError: if the gradient of a coordinate vanishes on the domain.
     """
     r = len(raw.offset)
-    # Angles keep their period, so they are turned instead of scaled
+    # Coordinates that are angles keep their period of 2 pi: they are shifted, not scaled
     if isinstance(raw.family, CircleFamily):
         return replace(raw, theta=raw.family.turned(raw.theta, raw.once("xi", origin[None, :])[0, :r]))
     lengths = np.linalg.norm(raw.once("jacobian", samples.points)[:, :r], axis=2).mean(axis=0)
@@ -266,13 +266,13 @@ def fix_gauge(coordinates: Coordinates, centre: Array) -> Coordinates:
 
     Coordinates that move the first joints come first. They are sorted by the mean index of the joints that move,
     sum_k k g_k^2 / |g|^2, with the gradient g at the centre of the domain. The joint with the largest |g_k| moves in
-    the positive direction. Coordinates that change places in the arm's mirror have the same mean; the one that moves
-    the first joint on which they differ further comes first. Idle joints stay last.
+    the positive direction. Coordinates that a mirror symmetry of the arm exchanges have the same mean index: of these,
+    the one with the larger g_k comes first, for the first joint k at which they differ. Idle joints stay last.
     """
     # The mean index of the joints that a coordinate moves, and the sign of its largest entry
     g = coordinates.once("jacobian", centre[None, :])[0, : len(coordinates.offset)]
     size = (g**2).sum(axis=1)
-    # Lengths of 0 belong to folds at the centre
+    # A gradient vanishes if the coordinate folds at the centre: avoid the division by zero
     moved = (g**2 @ np.arange(g.shape[1])) / np.where(size > 0, size, 1.0)
     largest = np.take_along_axis(g, np.abs(g).argmax(axis=1)[:, None], axis=1)[:, 0]
     signs = np.where(largest < 0, -1.0, 1.0)
@@ -300,7 +300,7 @@ def align(coordinates: Coordinates, chart: Chart, samples: Samples) -> Coordinat
         for J in (coordinates.jacobian(samples.points)[:, :fitted], chart.coordinates.jacobian(samples.points))
     )
     parallel = np.einsum("sin,sjn->ij", ours, theirs[:, :fitted]) / len(samples)
-    # The assignment of coordinates whose gradients are most parallel in the mean
+    # Pair the coordinates so that the sum of the mean |cosines| within pairs is largest
     theirs_in_order, order = scipy.optimize.linear_sum_assignment(-np.abs(parallel.T))
     signs = np.sign(parallel.T[theirs_in_order, order])
     back = np.empty(fitted)
@@ -329,7 +329,7 @@ def _reorder(coordinates: Coordinates, order: NDArray[np.int_], signs: Array) ->
 
 
 def _write_notes(solution: Solution, settings: FitSettings) -> dict[str, str | float]:
-    """Notes of the chart: how it was made."""
+    """Settings and results of the fit, which the chart keeps as notes."""
     weights, stages, worst = settings.weights, solution.stages, solution.worst
     searched = {} if worst is None else {"least conditioning": worst.least}
     extra = {f"weight of {name}": weight for name, weight in weights.extra.items()}
@@ -358,13 +358,13 @@ def offer_clear_part(problem: Problem, check: ProblemCheck, worst: WorstPoints |
     Returns:
         The offer; None if nothing is wrong, if charts fail elsewhere too, or if the centre itself would be left out.
     """
-    # Positions with a small conditioning, if the search found some
+    # Worst points where the conditioning is too small for a chart to be of use
     domain = problem.domain
     failed = np.zeros((0, problem.n)) if worst is None else worst.below(RULES.failed)
     clear = domain.singular_bound
     if not (isinstance(domain, Box) and (domain.is_box or clear)) or not (len(failed) or check.singular_samples):
         return None
-    # The bound that leaves most of them out, in whole steps, unless it is too large
+    # The least multiple of `bound_step` that leaves most of them out, unless it is too large
     try:
         measured = clear or ClearBox(domain, problem.task, RULES.any_bound)
         values = measured.singular_values(failed)
@@ -404,7 +404,7 @@ class Fit(Shown):
 
     @property
     def cyclic_joints(self) -> tuple[str, ...]:
-        """Names of joints at all of whose positions the chart holds, because its coordinates are linear in them."""
+        """Names of cyclic joints: the chart holds at all their positions, as its coordinates are linear in them."""
         coordinates = self.chart.coordinates
         family = coordinates.parametrisation if isinstance(coordinates, Coordinates) else None
         return tuple(family.cyclic) if isinstance(family, CyclicParametrisation) else ()

@@ -1,4 +1,4 @@
-"""Coordinates that are given quantities, or like them: gradients as near to theirs as they can be across the task."""
+"""Coordinates that are given quantities y(q), or follow them as far as orthogonality to the task permits."""
 
 from __future__ import annotations
 
@@ -42,14 +42,14 @@ class LikeRules:
     weight: float = 300.0  #: of the term of `fit`, between task (1000) and mutual angles (30)
     weight_of_one: float = 1.0  #: of the mean squared distance to the gradient of a quantity in wide fits, with r = 1
     weight_of_several: float = 0.01  #: the same with r > 1
-    along_task: float = 0.1  #: of the squares of what gradients have along the task, relative to the rest
-    still: float = 1e-9  #: of the largest projected gradient
+    along_task: float = 0.1  #: weight of squared differences along the task, relative to those along self-motions
+    still: float = 1e-9  #: least length that gradients are divided by
     still_motion: float = 1e-3  #: least change of a quantity for a unit self-motion, over the length of its gradient
-    scaled_against: float = 0.1  #: share of positions against the swivel up to which it gives a scale
-    enough_itself: float = 0.995  #: share of nonsingular positions on which a quantity is regular, to be xi itself
-    held_out: int = 2000  #: samples of the distances
-    held_out_of_meaning: int = 10_000  #: samples of the domain for errors of a meaning
-    quantiles: tuple[float, float] = (0.05, 0.95)  #: of rates of a meaning
+    scaled_against: float = 0.1  #: xi takes the swivel's scale if at most this share of positions moves against it
+    enough_itself: float = 0.995  #: share of nonsingular positions where a quantity must be regular to be taken as xi
+    held_out: int = 2000  #: samples on which distances are measured
+    held_out_of_meaning: int = 10_000  #: samples on which the errors of a meaning are measured
+    quantiles: tuple[float, float] = (0.05, 0.95)  #: of the rates dy/dxi of a meaning
 
 
 RULES = LikeRules()
@@ -58,7 +58,10 @@ RULES = LikeRules()
 def choose_quantities(
     problem: Problem, like: Likeness | None, exact: bool | None, parametrisation: Parametrisation | None
 ) -> tuple[Like | None, bool | None]:
-    """The quantities of `like`, or those that a parametrisation without parameters is; and whether xi is to be these.
+    """The quantities of `like` or of a parametrisation without parameters, and whether xi is exactly these.
+
+    Returns:
+        The quantities, or None. Then True to take them as xi, False to follow them, None to decide by regularity.
 
     Raises:
         InvalidValueError: if arguments contradict each other, or there are more quantities than coordinates.
@@ -70,8 +73,8 @@ def choose_quantities(
         if parametrisation.closed_form is not None and isinstance(given := parametrisation.for_problem(problem), Given):
             if like is not None or exact is False:
                 name = "exact" if like is None else "like"
-                raise InvalidValueError(name, f"given with {given.label}", "this left out: xi is what is given")
-            given.family(JointSpace.of(problem), problem.r)  # of the right shape
+                raise InvalidValueError(name, f"given with {given.label}", "no such argument: xi is this function")
+            given.family(JointSpace.of(problem), problem.r)  # raises an error if the shape is wrong
             return Like.of_given(given), True
     if like is None:
         if exact is not None:
@@ -85,15 +88,16 @@ def choose_quantities(
 
 
 def take_exactly(problem: Problem, quantities: Like, exact: bool | None, counted: Array) -> Coordinates | None:
-    """Quantities as coordinates, xi = y(q), if they are to be that.
+    """Take quantities as the coordinates themselves, xi = y(q), if `exact` or their regularity says so.
 
-    Coordinates of r quantities are regular where the volume of `RegularPart`, with r = 1 the cosine between gradient
-    and self-motion, is above the least one of wide charts, with the sign of the centre of the domain.
+    Such coordinates are regular where the volume of `RegularPart` has the sign that it has at the centre, and at least
+    the size that wide charts require. With r = 1 the volume is the cosine between gradient and self-motion.
 
     Args:
         problem: the problem, on the clear part of a branch.
         quantities: at most r quantities.
-        exact: True to take them on however small a part, False never, None where they are regular nearly everywhere.
+        exact: True takes them even if they are regular on a small part only, False never does, None does if they are
+            regular on 99.5 % of the counted positions.
         counted: nonsingular positions of the branch, (N, n).
 
     Returns:
@@ -109,7 +113,7 @@ def take_exactly(problem: Problem, quantities: Like, exact: bool | None, counted
     if count < problem.r:
         what = f"given with {count} {'quantity' if count == 1 else 'quantities'}"
         raise InvalidValueError("exact", what, f"{problem.r} of them, one for each coordinate; or leave it out")
-    # The quantities themselves: not shifted, and not scaled
+    # The offsets are 0 and the scales are 1, so that xi equals the quantities
     domain, space, r = problem.domain, JointSpace.of(problem), problem.r
     coordinates = Coordinates(quantities.given, space, (), np.zeros(0), np.zeros(r), np.ones(r))
     inside = counted[domain.contains(counted)]
@@ -118,24 +122,24 @@ def take_exactly(problem: Problem, quantities: Like, exact: bool | None, counted
     except DomainError:
         if not exact:
             return None
-        # That they are nowhere regular is worse
+        # If they are regular nowhere, this raises an error that says so
         quantities.project(sample_problem(problem, RULES.held_out, RULES.held_out))
-        turning = f"in the middle of branch '{problem.name}', self-motions do not change {listed(quantities.names)}"
+        turning = f"at the centre of branch '{problem.name}', self-motions do not change {listed(quantities.names)}"
         raise DomainError(f"{turning}: give a smaller box as branch, another branch, or another quantity") from None
     return coordinates if exact or np.mean(regular.contains(inside)) >= RULES.enough_itself else None
 
 
 def build_quantity(robot: Robot, like: Quantity | str) -> tuple[str, ca.Function]:
-    """Its name with a unit, and q (n, 1) -> the quantity (1, 1): a joint, the swivel, or a function of q."""
+    """Name and function q (n, 1) -> y (1, 1) of a quantity: a joint, the swivel, or a function of q."""
     q = ca.SX.sym("q", robot.n)
-    # By name: the swivel angle, or a joint
+    # A name is that of the swivel angle, or of a joint
     if isinstance(like, str):
         require_known("like", like, (SWIVEL, *robot.joint_names))
         if like == SWIVEL:
             return f"{SWIVEL} [rad]", sew_angle(robot, "conventional")
         k = robot.joint_names.index(like)
         return f"{like} [{'m' if robot.tree.prismatic[k] else 'rad'}]", dense_function("like", [q], [q[k]])
-    # Or any function of q with one value
+    # Otherwise it is a function of q with one value
     value = build_expression("like", like, q)
     require_shape("like", value.shape, (1, 1))
     name = str(getattr(like, "__name__", ""))
@@ -143,7 +147,7 @@ def build_quantity(robot: Robot, like: Quantity | str) -> tuple[str, ca.Function
 
 
 def _require_finite(slopes: Array) -> Array:
-    """The gradients of quantities, if all numbers are finite."""
+    """Return gradients of quantities, or raise InvalidValueError if some are not finite."""
     if not np.isfinite(slopes).all():
         raise InvalidValueError(
             "like", "quantities without a finite gradient in the domain", "others, or a smaller domain"
@@ -155,8 +159,8 @@ def _require_finite(slopes: Array) -> Array:
 class Like:
     """Quantities y(q) (k, 1) that the first k coordinates follow.
 
-    The gradient of xi_j ought to be that part of the gradient of y_j which is orthogonal to the task. Such a field is
-    no gradient in general, so a term of the loss holds the one against the other.
+    The target for the gradient of xi_j is the part of the gradient of y_j that is orthogonal to the task. In general
+    that vector field is not the gradient of any function, so a term of the loss keeps the difference small.
 
     Source:
         ours, docs/explanation/derivations_meaning.md#meaning.
@@ -167,13 +171,13 @@ class Like:
 
     @classmethod
     def of(cls, problem: Problem, like: Likeness) -> Like:
-        """Build from a task of lower priority, a quantity, or of several.
+        """Build from a task of lower priority, from a quantity, or from several.
 
-        A missing reference orientation of the task is taken at the centre of the domain.
+        If the task lacks a reference orientation, the one at the centre of the domain is taken.
         """
         robot = problem.robot
         q = ca.SX.sym("q", robot.n)
-        # A task stands for its components, relative to the centre of the domain
+        # The quantities of a task are its components
         if isinstance(like, Task):
             if not like.robot.tree.equals(robot.tree):
                 raise InvalidValueError("like", "a task of another robot", "one of the problem's robot")
@@ -181,7 +185,7 @@ class Like:
             labels = zip(like.labels, like.units, strict=True)
             names = tuple(f"{label} [{unit}]" if unit else label for label, unit in labels)
             return cls(names, _require_arms(robot, q, like.smooth_function(q)))
-        # All else is one quantity, or several
+        # Otherwise it is one quantity, or several
         parts = [like] if isinstance(like, str) or not isinstance(like, Sequence) else like
         quantities = [build_quantity(robot, part) for part in parts]
         if not quantities:
@@ -209,7 +213,7 @@ class Like:
 
     @property
     def label(self) -> str:
-        """What the coordinates mean, for the notes of a chart: 'like q3 [rad]; like height'."""
+        """Text for the notes of a chart: 'like q3 [rad]; like height'."""
         return "; ".join(f"like {name}" for name in self.names)
 
     @cached_property
@@ -220,7 +224,7 @@ class Like:
 
     @cached_property
     def periods(self) -> Array:
-        """2 pi for quantities that jump by whole turns, 0 for others, (k,)."""
+        """Periods of the quantities, (k,): 2 pi for angles that jump by whole turns, 0 for others [rad]."""
         return find_periods(self.given.tape)
 
     def require_at_most(self, count: int) -> None:
@@ -238,7 +242,7 @@ class Like:
         return BlockedFunction(dense_function("slopes", [q], [ca.jacobian(self.function(q), q)]))
 
     def build_term(self, problem: Problem, active: list[int]) -> LikeTerm:
-        """The term of the loss for coordinates of the active joints; the others stay at the centre of the domain.
+        """The term of the loss, for coordinates of the active joints. Other joints are at the centre of the domain.
 
         Raises:
             InvalidValueError: if there are fewer coordinates to fit than quantities.
@@ -249,32 +253,35 @@ class Like:
         whole[active] = q
         values = self.function(whole)
         slopes = dense_function("like_jacobian", [q], [ca.cse(ca.jacobian(values, q))])
-        # Functions of a loss are kept by names
+        # Functions of a loss are cached by the names of its terms, so different quantities need different names
         return LikeTerm(
             f"like {hashlib.sha256(json.dumps(write_tape(slopes)).encode()).hexdigest()[:12]}", len(self.names), slopes
         )
 
     def project(self, samples: Samples) -> tuple[Array, Array]:
-        """An orthonormal basis (N, n, n), the last r of ker J_x, and gradients of quantities along it, (N, k, n).
+        """Orthonormal bases (N, n, n), with columns, and components (N, k, n) of the quantities' gradients in them.
+
+        The last r columns of a basis span ker J_x.
 
         Raises:
-            InvalidValueError: if the task leaves nothing of a quantity, or what it leaves of some follows from others.
+            InvalidValueError: if self-motions hardly change a quantity, or only together with others.
         """
         m, B = samples.task_jacobian.shape[1], _split_directions(samples)
         slopes = self.differentiate(samples.points) @ B
-        # What self-motions move of each quantity, and whether that is enough to tell them apart
+        # Rates of the quantities along self-motions must not vanish, and must be linearly independent
         left = slopes[:, :, m:]
         gram = np.einsum("skj,slj->kl", left, left) / len(left)
         squares, least = gram.diagonal(), RULES.still_motion**2
         moving = (squares > least * (slopes**2).sum(axis=2).mean(axis=0)).all()
         if not moving or np.linalg.eigvalsh(gram / np.sqrt(np.outer(squares, squares)))[0] < least:
-            raise InvalidValueError("like", "quantities that the task leaves nothing of", "others, or another task")
+            came = "quantities that self-motions cannot change independently"
+            raise InvalidValueError("like", came, "others, or another task")
         return B, slopes
 
     def choose_directions(self, samples: Samples, centre: Samples) -> Array:
-        """Orthonormal directions (r, n) across the task at the centre, the first k in those of the quantities.
+        """Orthonormal directions (r, n) across the task at the centre, the first k along the quantities' gradients.
 
-        With r = 1, it is the one in which self-motions change the quantity at most samples.
+        With r = 1, its sign is the one for which the quantity grows along self-motions at most samples.
         """
         m = centre.task_jacobian.shape[1]
         across = _split_directions(centre)[0, :, m:].T
@@ -284,17 +291,21 @@ class Like:
         return np.asarray((Q * np.where(R.diagonal() < 0, -1.0, 1.0)).T @ across)
 
     def hold(self, samples: Samples, along: Callable[[Array], Array]) -> list[QuadraticTerm]:
-        """Weighted means of squared distances of gradients from those g_k of quantities, above all along self-motions.
+        """Loss terms that hold the gradients of coordinates to those g_k of quantities, mainly along self-motions.
 
-        They are those of |Z^T d_k|^2 + 0.1 |N^T d_k|^2 with the distance d_k = dxi_k/dq - g_k and orthonormal bases Z
-        of ker J_x and N of its complement. Weights are in proportion to 1 / (l_k^2 + |Z^T g_k|^2), with the median l_k
-        of |Z^T g_k|, and their sum to 1 / l_k^2: distances count relative to gradients where these are large, as near
-        positions at which a quantity jumps. With r = 1, a regular xi grows everywhere along z, so positions at which a
-        quantity that grows at most of them falls do not count.
+        Term k is a weighted mean over samples of |Z^T d_k|^2 + 0.1 |N^T d_k|^2, with d_k = dxi_k/dq - g_k and
+        orthonormal bases Z of ker J_x and N of its complement. The weight of a sample is in proportion to
+        1 / (l_k^2 + |Z^T g_k|^2), with the median l_k of |Z^T g_k|. So where gradients are large, as near a jump of the
+        quantity, relative differences count. The sum of the weights is in proportion to 1 / l_k^2. With r = 1, a
+        regular xi grows along z everywhere, so samples where the quantity changes against its usual sign have no
+        weight.
 
         Args:
             samples: N samples of all joints.
-            along: directions a (N, n) -> derivatives of the basis functions along them, (N, K).
+            along: function of directions (N, n) that returns derivatives of the basis functions along them, (N, K).
+
+        Returns:
+            One term for each quantity.
         """
         m = samples.task_jacobian.shape[1]
         B, slopes = self.project(samples)
@@ -304,12 +315,12 @@ class Like:
         terms = []
         for k in range(len(self.names)):
             squares = (slopes[:, k, m:] ** 2).sum(axis=1)
-            # Samples count alike, whatever the size of the quantity's rate there
+            # Weights of the samples
             even = 1 / (np.median(squares) + squares)
             if r == 1:
                 even *= slopes[:, k, m] * np.median(slopes[:, k, m]) > 0
             even *= (RULES.weight_of_one if r == 1 else RULES.weight_of_several) / even.sum() / np.median(squares)
-            # The quadratic form of coefficients that the mean square is
+            # The weighted mean is a quadratic form of the coefficients
             E, pull = np.zeros(()), np.zeros(())
             for j, part in enumerate(parts):
                 weighted = (shares[j] * even[:, None] * part).T
@@ -318,7 +329,7 @@ class Like:
         return terms
 
     def name_units(self, coordinates: Coordinates, posture: Array) -> Coordinates:
-        """Coordinates in the units of their quantities, with their values at a posture (n,)."""
+        """The same coordinates, the first k in the units of their quantities, and equal to them at a posture (n,)."""
         k = len(self.names)
         offset, scale = coordinates.offset.copy(), coordinates.scale.copy()
         raw = coordinates.once("xi", posture[None])[0, :k] / scale[:k] + offset[:k]
@@ -326,9 +337,10 @@ class Like:
         return replace(coordinates, offset=offset, scale=scale)
 
     def scale(self, coordinates: Coordinates, problem: Problem, posture: Array, seed: int) -> Coordinates | None:
-        """A coordinate with the median rate of the quantity along self-motions, and its value at a posture (n,).
+        """The coordinate, scaled so that self-motions change it as fast as the quantity, in the median.
 
-        None if it moves against the quantity at too many positions.
+        It is shifted to equal the quantity at a posture (n,). None if it grows where the quantity falls at some
+        positions, and both grow at others: at more than 10 % of each.
         """
         samples = sample_problem(problem, RULES.held_out, (seed, RULES.held_out))
         own, left = self._compare_rates(coordinates, samples)
@@ -344,19 +356,19 @@ class Like:
         )
 
     def measure_error(self, problem: Problem, coordinates: Coordinates, seed: int) -> MeaningError:
-        """What the first coordinate misses of the first quantity at samples of the domain, where it has a value."""
+        """How far the first coordinate is from the first quantity, at samples of the domain where both are finite."""
         samples = sample_problem(problem, RULES.held_out_of_meaning, (seed, RULES.held_out_of_meaning))
         value = Batched(self.function)(samples.points)[0].reshape(len(samples), -1)[:, 0]
-        # Where both have a value, angles by the shorter way
+        # Differences where the quantity is finite; those of angles are wrapped to half a turn
         own, left = self._compare_rates(coordinates, samples)
         finite = np.isfinite(value) & np.isfinite(left)
         xi, value = coordinates.once("xi", samples.points)[finite, 0], value[finite]
         period = float(self.periods[0])
         missed = wrap_shortest((xi - value)[:, None], np.array([period]))[:, 0]
         value = xi - missed
-        # How much of the quantity's rate is left along self-motions
+        # Changes of the quantity for a unit change of xi along self-motions
         slow, fast = np.quantile((left / own)[finite], RULES.quantiles)
-        # What no function of xi can explain
+        # The best monotone function of xi: what it leaves is not determined by xi
         order = np.argsort(xi)
         monotone = scipy.optimize.isotonic_regression(value[order])
         return MeaningError(
@@ -369,14 +381,14 @@ class Like:
         )
 
     def _compare_rates(self, coordinates: Coordinates, samples: Samples) -> tuple[Array, Array]:
-        """How fast self-motions change the first coordinate and the first quantity, (N,) each; z has any sign."""
+        """Rates of the first coordinate and the first quantity along the unit self-motion z of any sign, (N,) each."""
         z = samples.null_basis[:, :, 0]
         slopes = self._slopes(samples.points)[0].reshape(len(samples), len(self.names), -1)[:, 0]
         J = coordinates.once("jacobian", samples.points)[:, : samples.points.shape[1]]
         return tuple(np.einsum("sn,sn->s", rows, z) for rows in (J.reshape(len(samples), -1, z.shape[1])[:, 0], slopes))
 
     def measure_distances(self, problem: Problem, coordinates: Coordinates, seed: int) -> dict[str, float]:
-        """Root mean square angles between gradients of coordinates and what the task leaves of quantities' [deg]."""
+        """Root mean square angle of each coordinate's gradient to its quantity's, projected across the task [deg]."""
         samples, k = sample_problem(problem, RULES.held_out, (seed, RULES.held_out)), len(self.names)
         J, Z = coordinates.jacobian(samples.points)[:, :k], samples.null_basis
         left = self.differentiate(samples.points) @ Z
@@ -388,7 +400,7 @@ class Like:
 
 
 def _split_directions(samples: Samples) -> Array:
-    """An orthonormal basis (N, n, n), the last r of ker J_x; with r = 1, det [J_x; z^T] > 0 for that one."""
+    """Orthonormal bases (N, n, n); the last r columns span ker J_x. With r = 1, z has det [J_x; z^T] > 0."""
     J = samples.task_jacobian
     B = np.linalg.svd(J)[2].transpose(0, 2, 1)
     if J.shape[1] == J.shape[2] - 1:
@@ -397,7 +409,7 @@ def _split_directions(samples: Samples) -> Array:
 
 
 def _require_arms(robot: Robot, q: ca.SX, values: ca.SX) -> ca.Function:
-    """Quantities as a function of q, if no floating base moves them: xi depends on the arms' joints alone."""
+    """Quantities as a function of q. Raise InvalidValueError if a floating base moves them, as it must not move xi."""
     base = list(robot.tree.floating)
     if base and ca.depends_on(values, q[base]):
         raise InvalidValueError("like", "a quantity that a floating base moves", "a quantity of the arms' joints")
@@ -406,10 +418,10 @@ def _require_arms(robot: Robot, q: ca.SX, values: ca.SX) -> ca.Function:
 
 @dataclass(frozen=True)
 class LikeTerm:
-    """Mean over quantities of the squared distance between gradients, without their part along the task, over theirs.
+    """Mean over quantities of the squared relative difference between the gradients v_xi,j and g_j, across the task.
 
-    With an A-orthonormal basis z_1..z_r of ker J_x, the residuals are (v_xi,j - g_j) . z_k / |g_j|_A^-1, with the
-    gradient g_j of the quantity.
+    With an A-orthonormal basis z_1..z_r of ker J_x, the residuals are (v_xi,j - g_j) . z_k / |g_j|_A^-1, where g_j is
+    the gradient of quantity j.
     """
 
     name: str
@@ -432,17 +444,21 @@ class LikeTerm:
         return BlockedFunction(self.slopes)
 
     def turn(self, family: LinearFamily, theta: Array, samples: Samples, gradients: BasisGradients) -> Array:
-        """Combinations of coordinates, (r K,): the first k are nearest to the quantities, the others across them."""
+        """Coefficients (r K,) of combinations of the coordinates; the first k are nearest to the quantities.
+
+        The others have combinations orthogonal to those.
+        """
         C = theta.reshape(family.outputs, family.width)
         G = gradients.expand(gradients.at(samples.points), len(samples))
         Z = samples.null_basis
-        # Components across the task
+        # Components of the gradients along ker J_x
         own = np.einsum("rk,snk,snz->szr", C, G, Z, optimize=True).reshape(-1, len(C))
         slopes = _require_finite(self.batched(samples.points)[0].reshape(len(samples), self.count, -1))
         targets = (slopes @ Z).transpose(0, 2, 1)
         B = np.linalg.lstsq(own, targets.reshape(-1, self.count), rcond=None)[0].T  # (k, r)
         if np.linalg.matrix_rank(B) < self.count:
-            raise InvalidValueError("like", "quantities that the task leaves nothing of", "others, or another task")
+            came = "quantities that self-motions cannot change independently"
+            raise InvalidValueError("like", came, "others, or another task")
         return np.asarray((np.vstack([B, np.linalg.svd(B)[2][self.count :]]) @ C).ravel())
 
 
@@ -458,11 +474,11 @@ class QuadraticTerm(NamedTuple):
 class MeaningError:
     """How far a coordinate is from a quantity at samples of the domain, not only at home."""
 
-    rms: float  #: root mean square difference, in the unit of the quantity; of angles, the shortest
-    undetermined: float  #: the same after the best monotone map of the coordinate; angles within half a turn of it
-    correlation: float  #: of the two; angles are taken within half a turn of the coordinate
-    against: float  #: share of the positions at which self-motions change the two in opposite signs
-    slow: float  #: 5 % quantile of how much self-motions change the quantity for a unit change of the coordinate
+    rms: float  #: root mean square difference, in the unit of the quantity; differences of angles are wrapped
+    undetermined: float  #: the same after the best monotone map of the coordinate
+    correlation: float  #: between coordinate and quantity; angles are taken within half a turn of the coordinate
+    against: float  #: share of the positions at which self-motions change the two with opposite signs
+    slow: float  #: 5 % quantile of the quantity's change for a unit change of the coordinate, along self-motions
     fast: float  #: 95 % quantile of that
 
     @property
@@ -474,7 +490,7 @@ class MeaningError:
         return f"{rates}, {off}, correlation {self.correlation:.2f}, {against}"
 
     def write_notes(self) -> dict[str, float]:
-        """What the notes of a chart say."""
+        """The errors as notes of a chart."""
         return {
             "error of its meaning": self.rms,
             "error after the best monotone map": self.undetermined,

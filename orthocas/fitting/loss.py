@@ -8,7 +8,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.bases.family import Family, JointSpace, LinearFamily, Parametrisation, require_parametrisation
+from orthocas.bases.family import JointSpace, LinearFamily, Parametrisation, require_parametrisation
 from orthocas.fitting.sample_loss import Loss, build_sample_loss
 from orthocas.fitting.starts import find_spectral_start
 from orthocas.fitting.terms import (
@@ -19,7 +19,7 @@ from orthocas.fitting.terms import (
 )
 from orthocas.tasks.problem import Problem
 from orthocas.tasks.samples import evaluate_samples, sample_evenly
-from orthocas.tools.checks import Array, as_point_set, freeze_array, require_count, require_kind
+from orthocas.tools.checks import as_point_set, freeze_array, require_count, require_kind
 
 
 def loss(
@@ -72,47 +72,40 @@ def loss(
     else:
         points = as_point_set("samples", samples, problem.n)[0]
     drawn = evaluate_samples(problem, points)
-    # Parameters whose orientation counts: those that are given, or where a fit starts
+    # Parameters whose orientation the regularity term keeps: those that are given, or where a fit starts
     if start is not None:
         theta0 = freeze_array("start", start, (family.size,))
     elif isinstance(family, LinearFamily):
         theta0 = find_spectral_start(family, drawn)
     else:
         theta0 = family.initial(seed)
-    # J_xi of all samples as expressions of theta, (r n, N), each column by column
-    theta = ca.MX.sym("theta", family.size)
-    J = _build_jacobians(family, drawn.points, theta)
+    # J_xi of all samples as expressions of theta, (r n, N): the entries of each matrix, column by column, are a column
+    theta, (N, n) = ca.MX.sym("theta", family.size), drawn.points.shape
+    J: ca.MX
+    if isinstance(family, LinearFamily):
+        # Bases are linear in theta: J_xi = C G with constant gradients G at the samples
+        q = ca.SX.sym("q", n)
+        slopes = ca.Function("slopes", [q], [ca.densify(ca.jacobian(family.basis(q), q))])  # (K, n)
+        G = slopes.map(N)(ca.DM(drawn.points.T))  # (K, n N)
+        C = ca.reshape(theta, family.width, family.outputs).T
+        J = ca.reshape(C @ G, family.outputs * n, N)
+    else:
+        place = ca.MX.sym("q", n, N)
+        by_coordinate = ca.Function("gradients", [place, theta], family.jacobian(place, theta))
+        parts: list[Any] = by_coordinate.call([ca.MX(ca.DM(drawn.points.T)), theta])
+        J = ca.vertcat(*(gradient[i, :] for i in range(n) for gradient in parts))
     gradients = ca.Function("J", [theta], [J])(theta0).full().T.reshape(len(drawn), -1, problem.r)
     orientation = drawn.orientation(gradients.transpose(0, 2, 1))
-    # The loss of one sample, for all of them side by side
+    # Map the loss of one sample over all samples
     sizes = Sizes(problem.n, problem.m, problem.r, drawn.metric_inverse is None)
     of_sample = Loss.of(sizes, Weights.of(weights).for_problem(problem).by_name)
     one, column = build_sample_loss(of_sample), ca.SX.sym("J", problem.r * problem.n)
-    parts = [ca.SX.sym(name, one.numel_in(1 + k)) for k, name in enumerate(of_sample.data)]
-    shaped = [ca.reshape(part, *one.size_in(1 + k)) for k, part in enumerate(parts)]
+    symbols = [ca.SX.sym(name, one.numel_in(1 + k)) for k, name in enumerate(of_sample.data)]
+    shaped = [ca.reshape(symbol, *one.size_in(1 + k)) for k, symbol in enumerate(symbols)]
     value = one(ca.reshape(column, problem.r, problem.n), *shaped)
-    losses = ca.Function("losses", [column, *parts], [value]).map(len(drawn))
-    # Its mean, with the data of the samples as columns (entries, N), matrices column by column
+    losses = ca.Function("losses", [column, *symbols], [value]).map(len(drawn))
+    # The mean loss. The data of the samples are columns (entries, N), with the entries of matrices column by column
     data = drawn.collect_data(of_sample.data, orientation)
     flat = [(part.transpose(0, 2, 1) if part.ndim == 3 else part).reshape(len(part), -1).T for part in data]
     mean = ca.sum2(losses(J, *map(ca.DM, flat))) / len(drawn)
     return ca.Function("loss", [theta], [mean], ["theta"], ["loss"])
-
-
-def _build_jacobians(family: Family, points: Array, theta: ca.MX) -> ca.MX:
-    """J_xi of every sample column by column, (r n, N)."""
-    N, n = points.shape
-    # Bases are linear in theta: their gradients at the samples are numbers
-    if isinstance(family, LinearFamily):
-        q = ca.SX.sym("q", n)
-        slopes = ca.Function("slopes", [q], [ca.densify(ca.jacobian(family.basis(q), q))])  # (K, n)
-        G = slopes.map(N)(ca.DM(points.T))  # (K, n N)
-        C = ca.reshape(theta, family.width, family.outputs).T
-        linear: ca.MX = ca.reshape(C @ G, family.outputs * n, N)
-        return linear
-    # Other families as they differentiate themselves
-    place = ca.MX.sym("q", n, N)
-    gradients = ca.Function("gradients", [place, theta], family.jacobian(place, theta))
-    by_component: list[Any] = gradients.call([ca.MX(ca.DM(points.T)), theta])
-    stacked: ca.MX = ca.vertcat(*(gradient[i, :] for i in range(n) for gradient in by_component))
-    return stacked

@@ -1,4 +1,4 @@
-"""The loss of a network: with gradients by NumPy, or as one CasADi graph of dense products."""
+"""The loss of families that are not linear: of networks with NumPy arrays, of others with CasADi graphs."""
 
 from __future__ import annotations
 
@@ -26,15 +26,15 @@ from orthocas.tools.expressions import replay
 
 
 class _SampledLoss(ABC):
-    """Mean loss (25) of a family on fixed samples; how gradients are computed is left to subclasses.
+    """Mean loss (25) of a family on fixed samples. Subclasses evaluate it.
 
     Args:
         family: the coordinates.
         samples: fixed samples of the family's joints.
         weights: weights of the loss.
-        start: parameters, (size,), whose orientation the regularity term keeps.
+        start: parameters, (size,). The regularity term keeps the orientation of their coordinates.
         draw: draws fresh samples.
-        orientation: sign of the volume of the coordinates that the regularity term keeps. Default: that of the start.
+        orientation: sign of the coordinates' volume, which the regularity term keeps. Default: that of the start.
     """
 
     def __init__(
@@ -43,22 +43,21 @@ class _SampledLoss(ABC):
         m, n = samples.task_jacobian.shape[1:]
         self._draw, self._orientation = draw, orientation
         self._loss = Loss.of(Sizes(n, m, family.outputs, samples.metric_inverse is None), weights.by_name)
-        # The start orients coordinates, at some of the samples
+        # The orientation is that of the start at up to 200 of the samples
         if orientation is None and (self._loss.oriented or weights.folds > 0):
             some = samples[: RULES.orienting]
-            self._orientation = some.orientation(self._evaluate_jacobian(some.points, start))
+            q, theta = ca.MX.sym("q", n, len(some)), ca.MX.sym("theta", family.size)
+            graph = NumpyGraph("J_xi", [q, theta], [ca.vertcat(*family.jacobian(q, theta))])
+            (J,) = graph(np.ascontiguousarray(some.points), np.ascontiguousarray(start))
+            self._orientation = some.orientation(J.reshape(len(some), family.outputs, n))
         self._put(samples, len(samples))
 
     @abstractmethod
-    def _evaluate_jacobian(self, points: Array, theta: Array) -> Array:
-        """J_xi at points (N, n), (N, r, n)."""
-
-    @abstractmethod
     def _hold(self, points: Array, entries: Array, room: int) -> None:
-        """Use these samples, with all data of each in one row; sets for as much `room` share what is built."""
+        """Use these samples, with the data of each as a row of `entries`. Graphs are built for `room` samples."""
 
     def _put(self, samples: Samples, room: int) -> None:
-        """Use these samples; matrices enter their rows column by column."""
+        """Use these samples. The data of a sample are one row, with the entries of matrices column by column."""
         data, N = samples.collect_data(self._loss.data, self._orientation), len(samples)
         flat = [(part.transpose(0, 2, 1) if part.ndim == 3 else part).reshape(N, -1) for part in data]
         self._ends = np.cumsum([part.shape[1] for part in flat], dtype=int)
@@ -80,7 +79,7 @@ class _SampledLoss(ABC):
         return other
 
     def part(self, places: NDArray[np.int_] | slice) -> Self:
-        """The same loss on some of its samples, in this order."""
+        """The same loss on the samples at these places, in this order."""
         other = copy(self)
         other._points, other._entries = self._points[places], self._entries[places]
         other._hold(other._points, other._entries, len(other._points))
@@ -88,10 +87,10 @@ class _SampledLoss(ABC):
 
 
 class _Piece(NamedTuple):
-    """Some of the samples."""
+    """A part of the samples, which one thread evaluates at a time."""
 
     points: Array  #: (c, n)
-    data: list[Array]  #: what the loss needs, in blocks
+    data: list[Array]  #: data of the loss, in the blocks of `orthocas.tools.columns`
     shares: Array  #: weights of the samples in the mean, in blocks
 
 
@@ -126,12 +125,12 @@ class ArrayObjective(_SampledLoss):
 
     def value_and_gradient(self, theta: Array) -> tuple[float, Array]:
         """L(theta) and dL/dtheta."""
-        # Each piece: gradients of the network, loss and slopes by CasADi, slopes back to theta
+        # For each piece of samples: J_xi of the network, the loss and its slopes, and these pulled back to theta
         small, columns, sizes = self._round(theta), build_loss_columns(self._loss), self._loss.sizes
 
         def part(tools: tuple[Run, ArrayMemory], work: tuple[_Piece, Array]) -> float:
             (run, memory), (piece, result) = tools, work
-            # Forward through the network, the loss of each sample on its gradients, and back
+            # The network gives J_xi and a function `back`, which adds slopes with respect to theta to its result
             J, back = self._family.pullback(piece.points, small, memory)
             entries = arrange_blocks(J)
             losses, slopes = np.empty(piece.shares.shape), np.empty_like(entries)
@@ -142,7 +141,7 @@ class ArrayObjective(_SampledLoss):
             back(split_by_sample(by_entry, len(J)), result)
             return float(np.vdot(losses, piece.shares))
 
-        # Pieces of samples are shared by threads, and their gradients are added in one order
+        # Threads share the pieces. Gradients are added in the order of the pieces, so the sum is always the same
         threads = min(count_threads(), len(self._pieces))
         with columns.borrow(threads) as runs, self._memories.borrow(threads + 1) as (results, *memories):
             gradients = [results.array(f"piece {k}", small.shape, small.dtype) for k in range(len(self._pieces))]
@@ -154,18 +153,15 @@ class ArrayObjective(_SampledLoss):
         return value, gradient
 
     def _round(self, theta: Array) -> Array:
-        """Parameters with numbers of the type of the products."""
+        """Parameters in the number type of the products."""
         return theta.astype(np.float32 if self._single else np.float64)
-
-    def _evaluate_jacobian(self, points: Array, theta: Array) -> Array:
-        return self._family.pullback(points, theta)[0]
 
     def _hold(self, points: Array, entries: Array, room: int) -> None:
         self._arranged = list[_Piece]()
 
     @property
     def _pieces(self) -> list[_Piece]:
-        """The samples in pieces of nearly equal size, arranged once they are evaluated."""
+        """The samples in pieces of nearly equal size, which are arranged on first use."""
         if not self._arranged:
             N, entries = len(self._points), self._family.outputs * self._family.width
             most = max(RULES.least_piece, RULES.piece // entries)
@@ -178,7 +174,7 @@ class ArrayObjective(_SampledLoss):
 
 
 class GraphObjective(_SampledLoss):
-    """The loss of any family, with samples side by side as columns of CasADi's graphs."""
+    """The loss of any family, by CasADi graphs that take many samples at once as columns."""
 
     def __init__(
         self,
@@ -189,7 +185,7 @@ class GraphObjective(_SampledLoss):
         draw: Draw,
         orientation: float | None = None,
     ) -> None:
-        # Graphs by loss and number of columns; copies of the objective share them
+        # Cache: graphs by loss and number of columns. Copies of the objective share it
         self._family, self._graphs = family, dict[tuple[Loss, int], _LossGraph]()
         super().__init__(family, samples, weights, start, draw, orientation)
 
@@ -204,21 +200,13 @@ class GraphObjective(_SampledLoss):
         parts = [self._graph.both(start, *block) for block in self._blocks]
         return sum(float(value[0, 0]) for value, _ in parts), np.sum([slopes[0] for _, slopes in parts], axis=0)
 
-    def _evaluate_jacobian(self, points: Array, theta: Array) -> Array:
-        q, parameters = ca.MX.sym("q", points.shape[1], len(points)), ca.MX.sym("theta", self._family.size)
-        gradients = ca.vertcat(*self._family.jacobian(q, parameters))
-        (J,) = NumpyGraph("J_xi", [q, parameters], [gradients])(
-            np.ascontiguousarray(points), np.ascontiguousarray(theta)
-        )
-        return J.reshape(len(points), self._family.outputs, -1)
-
     def _hold(self, points: Array, entries: Array, room: int) -> None:
-        # A graph for all samples at once, or for as many as stay in the cache
+        # The graph takes all samples at once, or fewer, so that its matrices fit the cache
         columns = ceil(room / ceil(room / max(1, RULES.graph // (self._family.outputs * self._family.width))))
         if (self._loss, columns) not in self._graphs:
             self._graphs[self._loss, columns] = _LossGraph(self._family, self._loss, columns)
         self._graph = self._graphs[self._loss, columns]
-        # Points (c, n), data (entries, c) and shares (c,) of its columns; unused ones repeat samples with the weight 0
+        # Blocks have points (c, n), data (entries, c) and shares (c,). The last one repeats samples with the share 0
         self._blocks = []
         for k in range(0, len(points), columns):
             own = k + np.arange(columns) % min(columns, len(points) - k)
@@ -227,15 +215,15 @@ class GraphObjective(_SampledLoss):
 
 
 class _LossGraph:
-    """Loss and gradient of samples side by side: functions of theta, q (n, c), data (c, entries) and shares (c, 1)."""
+    """Loss and gradient for c samples at once: functions of theta, q (n, c), data (c, entries) and shares (c, 1)."""
 
     def __init__(self, family: Family, loss: Loss, columns: int) -> None:
-        # The graph of one sample's loss, replayed on columns of samples
+        # Replay the graph of one sample's loss on columns: every operation then acts on all samples
         theta, q = ca.MX.sym("theta", family.size), ca.MX.sym("q", loss.sizes.n, columns)
-        data = ca.MX.sym("data", columns, sum(symbol.numel() for symbol in loss.symbols()))
+        data = ca.MX.sym("data", columns, sum(symbol.numel() for symbol in loss.arguments()[1]))
         share = ca.MX.sym("share", columns)
         gradients = family.jacobian(q, theta)
-        # r times n columns of samples
+        # The entries of J_xi in the order of the graph's inputs, each a column with all samples
         by_component = [ca.horzsplit(gradient.T) for gradient in gradients]
         entries = [column for by_joint in zip(*by_component, strict=True) for column in by_joint]
         r = loss.sizes.r
@@ -243,16 +231,16 @@ class _LossGraph:
             build_loss_with_slopes(loss).tape, [*entries, *(ca.horzsplit(data) if loss.data else [])]
         )
         weighted = [ca.horzcat(*(share * slope for slope in slopes[j::r])) for j in range(r)]
-        # Chain rule, split at J_xi: the derivatives of the loss are one sample's graph, replayed on columns
+        # Chain rule: dL/dtheta from the slopes dL/dJ_xi and the derivatives of J_xi with respect to theta
         by_theta = ca.jtimes(ca.horzcat(*gradients), theta, ca.horzcat(*(part.T for part in weighted)), True)
         self._inputs, self._value, self._slope = [theta, q, data, share], ca.dot(share, values), ca.densify(by_theta)
 
     @cached_property
     def value(self) -> NumpyGraph:
-        """The loss alone."""
+        """Function that returns the loss."""
         return NumpyGraph("loss", self._inputs, [self._value])
 
     @cached_property
     def both(self) -> NumpyGraph:
-        """The loss and its gradient."""
+        """Function that returns the loss and its gradient."""
         return NumpyGraph("loss_and_gradient", self._inputs, [self._value, self._slope])

@@ -34,16 +34,16 @@ from orthocas.tools.interrupts import deferred
 class SuggestRules:
     """Numbers of the search for a domain, and of the trial charts that it evaluates."""
 
-    leak_deg: float = 8.0  #: asked by default
-    conditioning: float = 0.2  #: asked by default
-    margin: float = 1.25  #: trial charts keep a higher conditioning, since a fit is evaluated at more points
+    leak_deg: float = 8.0  #: default bound of the leak [deg]
+    conditioning: float = 0.2  #: default bound of the conditioning
+    margin: float = 1.25  #: factor of that bound for trial charts, because a fit is evaluated at more points
 
-    degree: int = 2  #: of trial charts: its conditioning is that of degree 4, its leak about a fifth larger
+    degree: int = 2  #: of trial charts: they have the conditioning of degree 4, and leaks about a fifth larger
     training: int = 700  #: even samples of a trial chart
     near_faces: int = 300  #: further samples near faces and corners
     held_out: int = 3000  #: samples that evaluate a trial chart
     many: int = 6  #: coordinates from which fits and their matrices take seconds
-    other: float = 2.0  #: factor of a half-width from which the matrix of another box steers no more
+    other: float = 2.0  #: factor of a half-width beyond which the Gauss-Newton matrix of another box is not reused
     seed: int = 0
     tiny: float = 1e-4  #: conditioning or singular value that counts as zero
 
@@ -51,7 +51,7 @@ class SuggestRules:
     step: float = 1.6  #: factor to the next scale while the boundary is unknown
     close: float = 1.06  #: the boundary is found within this factor
     smallest: float = 1e-3  #: scale of a box that is too small to be of use
-    exchanged: int = 28  #: joints that exchanges of width look at in all: five of five joints, one of many
+    exchanged: int = 28  #: about this many joints are tried in all rounds of exchange: five rounds with five joints
     least_step: float = 0.25  #: of an exchange; after one without gain, the next has half its step
     wider: float = 1.2  #: factor by which one joint alone is widened
     largest_exchange: float = float(np.log(1.5))
@@ -60,14 +60,14 @@ class SuggestRules:
 
     checked: int = 200  #: samples for whether the task can be regular at all, and which joints are idle
     confirmed: int = 30_000  #: samples that evaluate the fit
-    shrink: float = 0.92  #: after a fit that misses a bound
+    shrink: float = 0.92  #: factor of the half-widths after a fit that misses a bound
     tries: int = 12
-    descent: float = 0.5  #: fraction of the bound on the conditioning that descents from the worst samples keep, too
+    descent: float = 0.5  #: fraction of the bound on the conditioning that must hold even at the points of descents
 
-    first_time: int = 24  #: of a first scale, in trials without a fit
-    next_time: int = 14  #: of a next one
-    growth_time: int = 5  #: of a joint's growth
-    trials: int = 6  #: of a scale, about
+    first_time: int = 24  #: time for the first scale, in trials without a fit
+    next_time: int = 14  #: time for a later one
+    growth_time: int = 5  #: time for the growth of a joint
+    trials: int = 6  #: trials for a scale, about
 
 
 RULES = SuggestRules()
@@ -76,7 +76,7 @@ Miss = Literal["leak", "conditioning", "singularity", "half a turn"]  #: bounds 
 
 @dataclass(frozen=True)
 class Bounds:
-    """What is asked of coordinates on a box."""
+    """Bounds that coordinates must keep on a box."""
 
     leak_deg: float  #: largest leak [deg]
     conditioning: float  #: smallest conditioning
@@ -88,15 +88,15 @@ class Quality:
 
     leak_deg: float  #: root mean square over uniform samples and coordinates [deg]
     conditioning: float  #: the smallest at any sample; negative if det J changes its sign, because the chart folds over
-    worst_point: Array  #: where, (n,)
+    worst_point: Array  #: where the conditioning is smallest, (n,)
     task_value: float  #: smallest relative singular value of the task, see `orthocas.ClearBox`
     turn_value: float  #: cos(angle / 2) of the tool's largest turn from the reference; 1 for tasks without one
 
     def excess(self, bounds: Bounds) -> dict[Miss, float]:
-        """How much each value misses its bound, as a ratio of at most 1 where it keeps it, the largest first.
+        """Ratio of each value to its bound, the largest first; a ratio of at most 1 keeps the bound.
 
         "singularity" and "half a turn" are the bounds `NEAR_SINGULAR` and `NEAR_HALF_A_TURN` on the task itself, which
-        the conditioning does not see.
+        does not enter the conditioning.
         """
         ratios: dict[Miss, float] = {
             "leak": self.leak_deg / bounds.leak_deg,
@@ -123,17 +123,17 @@ class Quality:
 
 
 def describe_conditioning(signed: float) -> str:
-    """The least conditioning of a chart, which is negative where det J has the other sign, in words."""
+    """Describe the least conditioning of a chart, which is negative if det J changes its sign."""
     return f"has a conditioning of {signed:.3g}" if signed >= 0 else "folds over (det J changes its sign)"
 
 
 @dataclass(frozen=True, eq=False)
 class _Steered:
-    """A loss with the Gauss-Newton matrix of another box, which is nearly its own on the cube."""
+    """A loss with the Gauss-Newton matrix of another box, which is nearly the same in scaled joint positions."""
 
     loss: BasisObjective
     half_width: Array  #: of the box of the matrix, (n,)
-    matrix: list[Array]  #: its blocks
+    matrix: list[Array]  #: blocks of the matrix
 
     def value(self, theta: Array) -> float:
         """L(theta)."""
@@ -144,7 +144,7 @@ class _Steered:
         return self.loss.value_and_gradient(theta)
 
     def curvature_estimate(self, theta: Array) -> list[Array]:
-        """The matrix."""
+        """The matrix of the other box, in blocks."""
         return self.matrix
 
 
@@ -167,17 +167,17 @@ class _Start:
 class Prober:
     """Fits quadratic coordinates of the active joints on trial boxes.
 
-    Fits start from the coordinates of an earlier box, which are nearly the best already. From spectral starts of their
-    own, boxes that differ by a few percent end in different minima.
+    Fits start from the coordinates of an earlier box, which are nearly optimal already. With a spectral start for each
+    box, fits on boxes that differ by a few percent could end in different minima.
     """
 
     problem: Problem  #: robot, task and metric; trial boxes replace its domain
     active: list[int]  #: joints that are not coordinates themselves
     cyclic: tuple[str, ...] = ()  #: joints that enter linearly
-    weights: Weights = DEFAULT_WEIGHTS  #: of the fit that confirms the box; lengths and terms of others do not count
-    _objective: BasisObjective | None = None  #: of the last box; others only move it
-    _start: _Start | None = None  #: of the last box without folds; None: a spectral start
-    _kept: _Start | None = None  #: the start that kept the bounds last
+    weights: Weights = DEFAULT_WEIGHTS  #: of the fit that confirms the box; trials leave out lengths and extra terms
+    _objective: BasisObjective | None = None  #: of the last box; the next box moves it
+    _start: _Start | None = None  #: coordinates of the last box without folds; None for a spectral start
+    _kept: _Start | None = None  #: the last coordinates that kept the bounds
     _steered: _Steered | None = None  #: of the last box whose matrix was computed
 
     @property
@@ -186,12 +186,12 @@ class Prober:
         return len(self.active) - self.problem.m
 
     def evaluate(self, box: Box, enough: Bounds | None = None, leap: bool = False) -> Quality:
-        """Fit on a box, and evaluate.
+        """Fit coordinates on a box, and evaluate them.
 
         Args:
             box: the box.
             enough: if the coordinates of an earlier box keep these bounds, they are evaluated without a fit.
-            leap: whether to evaluate the coordinates of an earlier box without a fit, if there are some.
+            leap: whether to evaluate the coordinates of an earlier box without a fit in any case, if there are some.
 
         Raises:
             KeyboardInterrupt: after Ctrl-C.
@@ -201,7 +201,7 @@ class Prober:
             return self._evaluate(problem, lambda points: np.zeros((len(points), 0, len(self.active))))
         space = JointSpace.of(problem).restricted_to(self.active)
         family = Polynomial(RULES.degree, self.cyclic).family(space, self.outputs)
-        # The coordinates of an earlier box may do; if not, a fit begins from them
+        # The coordinates of an earlier box may be good enough; otherwise they are the start of a fit
         with one_blas_thread():
             if self._start is not None and (enough is not None or leap):
                 quality = self._evaluate(problem, self._gradients(family, self._start.on(family)))
@@ -215,7 +215,7 @@ class Prober:
             with deferred():
                 known = self._start
                 start = find_spectral_start(family, samples[: len(even)]) if known is None else known.on(family)
-                # The loss of the fit that confirms the box
+                # The loss is that of the fit that confirms the box, without lengths and extra terms
                 if self._objective is None:
                     weights = replace(self.weights.for_problem(problem), length=0.0, extra={})
                     objective = BasisObjective(family, samples, weights, start, lambda count, seed: samples)
@@ -227,7 +227,7 @@ class Prober:
             elif known is None:
                 result = QuasiNewton().coarser().minimise(objective, start)
             else:
-                # The matrix of a box that is not much wider or narrower serves
+                # Reuse the matrix of the last such box, unless a half-width differs by more than a factor of two
                 width, steered = family.space.half_width, self._steered
                 if steered is None or np.abs(np.log(width / steered.half_width)).max() > np.log(RULES.other):
                     self._steered = _Steered(objective, width, objective.curvature_estimate(start))
@@ -244,24 +244,30 @@ class Prober:
         return quality
 
     def go_back(self) -> None:
-        """Start from the coordinates that kept their bounds last, if there are any."""
+        """Start the next fit from the last coordinates that kept the bounds, if there are any."""
         self._start = self._start if self._kept is None else self._kept
 
     def start_on(self, family: ProductFamily) -> Array | None:
-        """Coefficients (size,) of the last coordinates without folds in a family of other degrees on another box."""
+        """Coefficients (size,) of the last coordinates without folds, in a family of another degree and box.
+
+        None without such coordinates, or if the family is linear.
+        """
         if self._start is None:
             return None
         quadratic = Polynomial(RULES.degree, self.cyclic).family(family.space, self.outputs)
-        # Linear coordinates cannot hold quadratic ones
+        # A linear family cannot represent quadratic coordinates
         if not set(quadratic.terms) <= set(family.terms):
             return None
         return family.embed(self._start.on(quadratic), quadratic)
 
     def least(self, problem: Problem, seed: int) -> float:
-        """Least conditioning of the last coordinates on another domain, by descent; 1 if a fit finds it as soon."""
+        """Least conditioning of the last coordinates on another domain, by descent.
+
+        1 for fewer than six coordinates, whose fit takes no longer than this search.
+        """
         if self._start is None or self.outputs < RULES.many:
             return 1.0
-        # Coordinates of the last trial, as a chart would have them
+        # Build the coordinates of the last trial for the chart's joints
         parametrisation = Polynomial(RULES.degree, self.cyclic)
         family = parametrisation.family(JointSpace.of(problem).restricted_to(self.active), self.outputs)
         idle = tuple(k for k in range(problem.n) if k not in self.active)
@@ -275,7 +281,7 @@ class Prober:
         return evaluate_at(problem, points, jacobian, self.active)
 
     def _gradients(self, family: ProductFamily, theta: Array) -> Callable[[Array], Array]:
-        """Points (N, n) -> gradients in the active joints, (N, r, active)."""
+        """A function of points (N, n) that returns gradients in the active joints, (N, r, active)."""
         C = theta.reshape(self.outputs, family.width)
 
         def jacobian(points: Array) -> Array:
@@ -288,10 +294,10 @@ class Prober:
 
 
 def evaluate_chart(chart: Chart, samples: int, seed: int) -> Quality:
-    """Quality of a fitted chart, without its idle joints, on samples of its domain, many near faces and corners."""
+    """Quality of a fitted chart, without its idle joints, on samples of its domain, two thirds near its boundary."""
     coordinates = chart.coordinates
     assert isinstance(coordinates, Coordinates)
-    # Coordinates that were fitted, in the joints that they depend on
+    # Take the fitted coordinates, in the joints that they depend on
     fitted, active = len(coordinates.offset), coordinates.active
 
     def jacobian(points: Array) -> Array:
@@ -302,10 +308,10 @@ def evaluate_chart(chart: Chart, samples: int, seed: int) -> Quality:
 
 
 def evaluate_at(problem: Problem, points: Array, jacobian: Callable[[Array], Array], active: list[int]) -> Quality:
-    """Quality at the result of `sample_boundary_weighted`.
+    """Quality at samples of `sample_boundary_weighted`.
 
-    Without fitted coordinates, such as where all are idle joints, nothing leaks, and det J has another sign where a
-    singular posture of the task lies between.
+    If all coordinates are idle joints, the leak is 0 and the conditioning 1. If det J then changes its sign, a singular
+    posture of the task lies between the samples, and the task value is 0.
 
     Args:
         problem: robot, task and metric.
@@ -314,7 +320,7 @@ def evaluate_at(problem: Problem, points: Array, jacobian: Callable[[Array], Arr
         active: the active joints.
     """
     samples = evaluate_samples(problem, points)
-    # Leaks count at uniform samples, conditioning at all of them
+    # Leaks are taken at the uniform samples, which come first, and the conditioning at all samples
     J, own = jacobian(samples.points), samples.restricted_to(active)
     uniform = len(samples) - 2 * (len(samples) // 3)
     leaks, conditioning = compute_leak_and_conditioning(own, J)
@@ -332,7 +338,7 @@ def compute_leak_and_conditioning(samples: Samples, J: Array) -> tuple[Array, Ar
 
     The leak of a coordinate is the angle, in the metric, between its gradient and the space orthogonal to the task. The
     conditioning is the smallest singular value of [A-orthonormal task basis; unit coordinate gradients]. It is negative
-    where det J has the opposite sign of most samples.
+    where the sign of det J is opposite to that at most samples.
     """
     sines, conditioning, signs = in_the_metric(samples, J)
     usual = 1.0 if signs.sum() >= 0 else -1.0

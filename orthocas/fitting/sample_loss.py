@@ -1,4 +1,4 @@
-"""The loss of one sample: weighted residuals of the gradients d xi / dq, and derivatives, on columns of samples."""
+"""The loss of one sample, half the sum of squared residuals of d xi / dq, and its derivatives, for many samples."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ from orthocas.tools.cached import cached_property
 from orthocas.tools.checks import Array
 from orthocas.tools.columns import COLUMNS, ColumnFunction, Run
 
-# Coordinates from which arrays are faster than what is written out
+# Number of coordinates from which NumPy arrays are faster than CasADi expressions
 _BY_ARRAYS = 8
 
 
 @dataclass(frozen=True)
 class Loss:
-    """The loss of one sample: L = |rho|^2 / 2, with the residuals of all terms with a positive weight.
+    """The loss of one sample: L = |rho|^2 / 2, with the residuals rho of all terms that have a positive weight.
 
-    Rows are in the order of the terms, with those of hinge terms last.
+    The rows of rho are in the order of the terms, with those of hinge terms last.
     """
 
     sizes: Sizes
@@ -42,7 +42,7 @@ class Loss:
 
     @classmethod
     def of(cls, sizes: Sizes, weights: Mapping[str, float], exchanged: Pairs = ()) -> Loss:
-        """The terms with a positive weight.
+        """The loss of the terms with a positive weight.
 
         Raises:
             UnknownNameError: if there is no term for a weight.
@@ -58,7 +58,7 @@ class Loss:
 
     @cached_property
     def data(self) -> tuple[str, ...]:
-        """The sample data that the terms need, in the order of the inputs of this module's functions."""
+        """Names of the sample data that the terms need, in the order in which functions of this module take them."""
         needed = {name for term, _ in self.terms for name in term.data}
         if self.sizes.identity_metric:
             needed.discard("metric_inverse")
@@ -66,12 +66,12 @@ class Loss:
 
     @cached_property
     def oriented(self) -> bool:
-        """Whether the loss needs a null basis with the orientation of the coordinates."""
+        """Whether the loss needs a null basis, oriented like the coordinates."""
         return "null_basis" in self.data
 
     @cached_property
     def array_terms(self) -> tuple[tuple[float, ArrayTerm], ...]:
-        """Weights and terms that arrays evaluate: none of few coordinates."""
+        """Weights and terms that NumPy arrays evaluate; none for fewer than 8 coordinates."""
         if self.sizes.r < _BY_ARRAYS:
             return ()
         terms = ((weight, term) for term, weight in self.terms if isinstance(term, ArrayTerm))
@@ -79,12 +79,12 @@ class Loss:
 
     @property
     def all_by_arrays(self) -> bool:
-        """Whether arrays evaluate all terms, of coordinates that are not exchanged."""
+        """Whether arrays evaluate all terms, and no coordinates are exchanged."""
         return len(self.array_terms) == len(self.terms) and not self.exchanged
 
     @cached_property
     def volume_terms(self) -> tuple[tuple[float, RegularityTerm], ...]:
-        """Those among them whose determinants are too large to be written out."""
+        """Those of `array_terms` whose determinants are too large to be written as expressions."""
         return tuple((weight, term) for weight, term in self.array_terms if isinstance(term, RegularityTerm))
 
     @cached_property
@@ -98,10 +98,6 @@ class Loss:
         kept = tuple(pair for pair in self.weights if pair[0] not in names)
         return Loss(self.sizes, kept, self.exchanged) if names else self
 
-    def symbols(self) -> list[ca.SX]:
-        """Symbols of the data of one sample, in the order of `data`."""
-        return [ca.SX.sym(name, *SAMPLE_DATA[name](self.sizes)) for name in self.data]
-
     def residuals(self, coordinate_jacobian: ca.SX, data: list[ca.SX]) -> ca.SX:
         """Residuals rho of one sample, (rows, 1)."""
         named = dict(zip(self.data, data, strict=True))
@@ -111,7 +107,7 @@ class Loss:
 
     @cached_property
     def smooth_rows(self) -> tuple[tuple[int, ...], ...]:
-        """For every coordinate j, the rows of `written_out` that depend on it, without hinge rows."""
+        """For every coordinate j, the rows of `written_out` that depend on it, except hinge rows."""
         touched = self._touched
         return tuple(
             tuple(row for row, coordinates in enumerate(touched) if j in coordinates and row not in self.hinge_rows)
@@ -120,7 +116,7 @@ class Loss:
 
     @cached_property
     def shared_rows(self) -> tuple[tuple[int, int, int], ...]:
-        """(i, j, row) with i > j for every row that depends on both coordinates, without hinge rows."""
+        """(i, j, row) with i > j for every row that depends on both coordinates i and j, except hinge rows."""
         return tuple(
             (i, j, row)
             for row, coordinates in enumerate(self._touched)
@@ -138,7 +134,7 @@ class Loss:
 
     @cached_property
     def smooth_count(self) -> int:
-        """Number of residuals without hinges."""
+        """Number of residuals of terms that are no hinges."""
         J, data = self.arguments()
         named = dict(zip(self.data, data, strict=True))
         return sum(term.residuals(J, named, self.sizes).shape[0] for term, _ in self.terms if not term.hinge)
@@ -157,13 +153,14 @@ class Loss:
         return [sorted(coordinates) for coordinates in touched]
 
     def arguments(self) -> tuple[ca.SX, list[ca.SX]]:
-        """Symbols of J_xi (r, n) and of the data of one sample."""
-        return ca.SX.sym("J", self.sizes.r, self.sizes.n), self.symbols()
+        """CasADi symbols for J_xi (r, n) and for the data of one sample, in the order of `data`."""
+        symbols = [ca.SX.sym(name, *SAMPLE_DATA[name](self.sizes)) for name in self.data]
+        return ca.SX.sym("J", self.sizes.r, self.sizes.n), symbols
 
 
 @cache
 def build_sample_loss(loss: Loss) -> ca.Function:
-    """Loss of one sample (1, 1) as a function of J_xi (r, n) and the data in `Loss.symbols`."""
+    """Loss of one sample (1, 1) as a function of `Loss.arguments`."""
     J, data = loss.arguments()
     return ca.Function("build_sample_loss", [J, *data], [ca.sumsqr(loss.residuals(J, data)) / 2])
 
@@ -178,13 +175,13 @@ def build_loss_with_slopes(loss: Loss) -> ColumnFunction:
 
 @cache
 def build_loss_columns(loss: Loss) -> ColumnFunction | LossByArrays:
-    """Like `build_loss_with_slopes`; of many coordinates by arrays."""
+    """Like `build_loss_with_slopes`, but arrays evaluate the `array_terms`."""
     return LossByArrays(loss, build_loss_with_slopes) if loss.array_terms else build_loss_with_slopes(loss)
 
 
 @cache
 def build_value_columns(loss: Loss) -> ColumnFunction | LossByArrays:
-    """Loss of one sample, with the inputs of `build_sample_loss`."""
+    """Loss of one sample without derivatives, with the inputs of `build_sample_loss`."""
 
     def written(part: Loss) -> ColumnFunction:
         return ColumnFunction(build_sample_loss(part))
@@ -205,7 +202,7 @@ def build_residual_columns(loss: Loss) -> Callable[..., list[Array]]:
     J, data = loss.arguments()
     r, n = loss.sizes.r, loss.sizes.n
     rho = loss.residuals(J, data)
-    # Its columns are the entries of J_xi, column by column
+    # The columns of this Jacobian belong to the entries of J_xi, taken column by column
     by_entry = ca.jacobian(rho, ca.vec(J))
     outputs = [by_entry[list(loss.smooth_rows[j]), j::r] for j in range(r)]
     for row in loss.hinge_rows:
@@ -215,7 +212,7 @@ def build_residual_columns(loss: Loss) -> Callable[..., list[Array]]:
 
 @cache
 def build_curvature_columns(loss: Loss) -> ColumnFunction:
-    """Second derivatives of the loss of one sample with respect to J_xi column by column, (n r, n r).
+    """Second derivatives (n r, n r) of the loss of one sample with respect to J_xi, taken column by column.
 
     The inputs are those of `build_sample_loss`.
     """
@@ -227,7 +224,7 @@ def build_curvature_columns(loss: Loss) -> ColumnFunction:
 
 
 def _add_volumes(loss: Loss, J: Array, *data: Array) -> list[Array]:
-    """The outputs of `build_residual_columns` where LAPACK computes volumes."""
+    """Evaluate the outputs of `build_residual_columns` for a loss with volume terms, by LAPACK."""
     rest = loss.written_out
     results = [np.empty((len(J), 0, COLUMNS)) for _ in range(loss.sizes.r)]
     if rest.weights:
@@ -242,18 +239,18 @@ def _add_volumes(loss: Loss, J: Array, *data: Array) -> list[Array]:
 
 
 class SampleBlock:
-    """Unit gradients and data of a block of samples, one sample after the other.
+    """Unit gradients and data of a block of c samples, as arrays with one matrix for each sample.
 
     Args:
         loss: the loss.
-        J: J_xi (n r, c), column by column.
-        data: data of the loss (entries, c), column by column.
+        J: entries (n r, c) of J_xi, column by column.
+        data: entries (entries, c) of each of the loss's data, column by column.
     """
 
     def __init__(self, loss: Loss, J: Array, data: Sequence[Array]) -> None:
         sizes = loss.sizes
         self._pairs = loss.exchanged
-        #: data by name, (c, rows, columns)
+        #: the data by name, (c, rows, columns)
         self.data = {name: _split(array, SAMPLE_DATA[name](sizes)) for name, array in zip(loss.data, data, strict=True)}
         rows = _turn(_split(J, (sizes.r, sizes.n)), self._pairs)
         self.units = UnitGradients.of(rows, self.data.get("metric_inverse"))
@@ -265,22 +262,22 @@ class SampleBlock:
 
 
 def _split(entries: Array, shape: tuple[int, int]) -> Array:
-    """Matrices (c, rows, columns) from their entries (rows columns, c), column by column."""
+    """Matrices (c, rows, columns) from their entries (rows * columns, c), which are listed column by column."""
     return np.ascontiguousarray(entries.reshape(shape[1], shape[0], -1).transpose(2, 1, 0))
 
 
 def _turn(rows: Array, pairs: Pairs) -> Array:
-    """Coordinates of components, (c, r, n)."""
+    """Gradients (c, r, n) of coordinates from those of their components."""
     return np.stack(coordinates_of(list(rows.transpose(1, 0, 2)), pairs), axis=1) if pairs else rows
 
 
 class LossByArrays:
-    """A loss on columns of samples, like a `ColumnFunction`, with terms that arrays evaluate.
+    """A loss on columns of samples, used like a `ColumnFunction`. NumPy arrays evaluate its `array_terms`.
 
     Args:
         loss: with at least one such term.
         written: makes the function of the other terms.
-        slopes: whether outputs are values and slopes, or only values.
+        slopes: whether the outputs are values and slopes, or values only.
     """
 
     def __init__(self, loss: Loss, written: Callable[[Loss], ColumnFunction], slopes: bool = True) -> None:
@@ -300,7 +297,7 @@ class LossByArrays:
 
     @contextmanager
     def borrow(self, count: int) -> Iterator[list[Run]]:
-        """Functions of blocks for so many threads; see `ColumnFunction.borrow`."""
+        """Functions of one block each, for `count` threads; see `ColumnFunction.borrow`."""
         with ExitStack() as stack:
             written: Sequence[Run | None] = [None] * count
             if self._written is not None:
@@ -310,8 +307,7 @@ class LossByArrays:
     def build_curvatures(self, J: Array, data: Sequence[Array]) -> list[Array]:
         """D_j^T D_j (c, n, n) of every coordinate j in single precision, for a block of samples with J_xi (n r, c).
 
-        D_j are the derivatives of all residuals with respect to row j of J_xi. All terms are arrays, and no coordinates
-        are exchanged.
+        D_j holds the derivatives of all residuals with respect to row j of J_xi. The loss must be `all_by_arrays`.
         """
         block = SampleBlock(self._loss, J, data)
         terms = [(weight, term.build_curvatures(block.units, block.data)) for weight, term in self._loss.array_terms]
@@ -327,7 +323,7 @@ class LossByArrays:
                     result[...] = 0.0
             else:
                 written([arguments[0], *(arguments[1 + k] for k in self._places)], results)
-            # Then the terms of arrays
+            # Add the terms that arrays evaluate
             block = SampleBlock(self._loss, arguments[0], arguments[1:])
             slopes = np.zeros(block.units.rows.shape)
             for weight, term in self._loss.array_terms:

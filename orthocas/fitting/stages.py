@@ -1,4 +1,4 @@
-"""The stages of a fit, from low degrees to high ones: each minimises an objective on samples. And their settings."""
+"""The stages of a fit, and its settings. Each stage minimises a loss on samples; degrees rise from stage to stage."""
 
 from __future__ import annotations
 
@@ -57,16 +57,16 @@ class FitRules:
     default_degree: int = 5
     degree_with_bound: int = 4  #: with a bound on mutual angles
     lower_degrees: tuple[tuple[int, int], ...] = ((8, 4), (9, 3), (12, 2))  #: joints, and the degree from there on
-    many_joints: int = 8  #: with more, coordinates are many as well, and the matrix grows with their square
-    many_terms: int = 300  #: where a Gauss-Newton matrix takes longer than ten gradients: degree 4 for seven joints
+    many_joints: int = 8  #: with more joints, coordinates are many as well, and the matrix grows with their square
+    many_terms: int = 300  #: from here on a Gauss-Newton matrix takes longer than ten gradients: degree 4, 7 joints
     least_bound_deg: float = 1e-6  #: on mutual angles; rounding hides smaller ones
 
     least_samples: int = 1000  #: of bases
-    residuals: int = 140  #: per coefficient, for which samples are drawn beyond these
+    residuals: int = 140  #: per coefficient: number of residuals of the samples beyond `least_samples`
     residuals_in_metric: int = 70  #: the same in another metric than the identity: leaks are of the same size
-    renewal_in_metric: float = 0.95  #: of the matrix of QuasiNewton there, where losses fall along long valleys
+    renewal_in_metric: float = 0.95  #: `renewal` of QuasiNewton there, where losses fall along long valleys
     tolerance_of_many: float = 1e-3  #: of the solver for many joints: half the time, and leaks are 2 % larger
-    residuals_of_many: int = 100  #: the same for coordinates of many joints, and nothing beyond them
+    residuals_of_many: int = 100  #: per coefficient, of all samples, for many joints
     network_samples: int = 2000  #: of families that are not linear in their parameters
     first: int = 200  #: samples that scale coordinates
     first_tag: int = 1000  #: their seed tag; stages use other tags
@@ -106,7 +106,7 @@ class Stage:
 
 @dataclass(frozen=True, eq=False)
 class Solution:
-    """Finished minimisations, the parametrisation that they reached, and its worst points if a search was made."""
+    """Finished stages, the parametrisation of the last one, and its worst points if there was a search."""
 
     stages: tuple[Stage, ...]
     parametrisation: Parametrisation
@@ -119,12 +119,12 @@ class Solution:
 
 
 class Continuation:
-    """Solves a low degree from a spectral start, embeds the result, and solves the next degree.
+    """Solves a low degree from a spectral start, embeds the result in the next degree, and solves that one.
 
-    The worst points of each degree join the loss of the next one. The last degree is solved again until its least
-    conditioning is large enough or, without a fold, no longer grows. Where the last round folds but an earlier one did
-    not, the best one is the result. If folds remain after some rounds, or at once where the domain holds singular
-    positions, the domain forces them: then the last stage leaves the fold term out.
+    The worst points of each degree from 3 on join the loss of the next one. The last degree is solved again, in up to
+    four more rounds, until its least conditioning is large enough or, without a fold, no longer grows. If the last
+    round folds but an earlier one did not, the best round is the result. If it folds and the domain has near-singular
+    positions, these force the fold: then the degree is solved once more without the fold term.
 
     Args:
         problem: problem of the fit.
@@ -132,9 +132,9 @@ class Continuation:
         active: joints that are not coordinates themselves.
         monitor: called with progress.
         folds: collects worst points.
-        like: what the first coordinates follow.
-        begin: gives parameters of polynomials to start from, instead of a spectral start. Without a mirror only, since
-            coordinates of another fit need not be even and odd.
+        like: the loss term of the quantities that the first coordinates follow.
+        begin: gives parameters of polynomials to start from, instead of a spectral start. It is not used with a mirror
+            symmetry, because coordinates of another fit need not be even or odd.
     """
 
     def __init__(
@@ -152,14 +152,14 @@ class Continuation:
         self.space, self.r = JointSpace.of(problem).restricted_to(active), len(active) - problem.m
         self._stages: list[Stage] = []
         self._reached: tuple[Parametrisation, Family] | None = None
-        # What is built once: families by label, gradients of bases, spectral starts by number of samples and mirror
+        # Caches: families by label, gradients by family, spectral starts by family, number of samples, use of a mirror
         self._families: dict[str, Family] = {}
         self._bases: dict[LinearFamily, BasisGradients] = {}
         self._starts: dict[tuple[LinearFamily, int, bool], Array] = {}
 
     def run(self) -> Solution:
         """Run all stages. After Ctrl-C, the last one is marked as interrupted."""
-        # Degree by degree, if the family has degrees
+        # One step for each degree, if the family has degrees
         target, folds = self.settings.parametrisation, self.folds
         steps: list[Parametrisation] = [target]
         if isinstance(target, GradedParametrisation):
@@ -171,7 +171,7 @@ class Continuation:
         try:
             for step in steps:
                 self._solve(step, step.label, final=step is last)
-            # The last one again, until there is no point of small conditioning, or its conditioning no longer grows
+            # Solve the last step again, until its least conditioning is large enough or no longer grows
             for k in range(2, 2 + RULES.rounds):
                 unfolded = folds.least >= LOSS_RULES.least_conditioning
                 settled = 0 <= folds.least < before + RULES.least_gain
@@ -181,10 +181,10 @@ class Continuation:
                     best = folds.least, len(self._stages), folds.worst
                 before = folds.least
                 self._solve(last, f"{last.label}, round {k}", final=True)
-            # New points may bring back folds that an earlier round had left behind
+            # The worst points of a round may cause folds elsewhere: if an earlier round had none, take the best one
             if folds.least < min(best[0], 0):
                 self._stages, folds.worst = self._stages[: best[1]], best[2]
-            # The domain forces folds: their term would only spoil the rest
+            # Singular positions of the domain force folds: the fold term would only make the rest of the chart worse
             if folds.least < 0 and folds.singular:
                 folds.give_up()
                 self._solve(last, f"{last.label}, with folds", final=True)
@@ -196,42 +196,43 @@ class Continuation:
         return Solution(tuple(self._stages), self._reached[0], folds.worst)
 
     def _solve(self, step: Parametrisation, label: str, final: bool) -> None:
-        """Run a stage from the last result, and search the worst points of its own.
+        """Run a stage from the last result, and search for the worst points of its coordinates.
 
         Raises:
-            SolveError: if there is no usable point. Only the final stage has to satisfy a bound on mutual angles.
+            SolveError: if the solver fails, or a final stage misses the bound on mutual angles.
         """
         settings, problem, family = self.settings, self.problem, self._family(step)
         degree = step.degree if isinstance(step, GradedParametrisation) else 0
-        # Only the last degree is solved exactly, but in another metric than the identity: the loss has long valleys
-        # there, and steps of low degrees cost little.
+        # With A = I, only the last degree is solved to the full tolerance. Other metrics give the loss long valleys:
+        # there all degrees are, because steps of low degrees cost little
         solver = settings.solver if final or not problem.metric.is_identity else settings.solver.coarser()
-        # Samples: half of them where a mirror symmetry halves the coefficients
+        # A mirror symmetry halves the coefficients, and then half of the samples suffice
         mirror = self.mirror
         kept = mirror.kept(family) if isinstance(family, LinearFamily) and mirror is not None else None
         count = self._count_samples(family, kept)
         self.monitor(Progress(label, 0.0, f"sampling {count} points"))
-        # Graphs of other families are few large products: they need the threads of BLAS more than the last digits
+        # Graphs of other families consist of few large products: there the threads of BLAS save more time, although
+        # the last digits then depend on their number
         with one_blas_thread() if isinstance(family, LinearFamily | ArrayFamily) else nullcontext():
             samples = self._sample(count, (settings.seed, 1 + degree))
             # CasADi may swallow Ctrl-C while graphs are built
             with deferred():
                 objective, start = self._build_objective(label, family, samples, None if kept is None else mirror)
             result = solver.minimise(objective, start, Watch(self.monitor, label))
-        # A bound on mutual angles has to be met in the end only
+        # Only the final stage has to meet a bound on mutual angles
         if isinstance(objective, BoundedMutual) and not np.isfinite(result.value):
             if final:
                 assert settings.max_mutual is not None
                 raise objective.explain_missed_bound(label, settings.max_mutual, result)
         else:
             result.raise_if_failed()
-        # Back from the free components to all coefficients
+        # Convert the free coefficients of the components to all coefficients of the coordinates
         if kept is not None and mirror is not None:
             result = replace(result, theta=mirror.coordinates(expand(result.theta, kept)))
         stage = Stage(label, family.size, len(samples), result)
         self._stages.append(stage)
         self._reached = step, family
-        # The worst points of low degrees differ from those of the last one
+        # Low degrees are not searched: their worst points differ from those of the last degree
         if result.status is Status.INTERRUPTED:
             raise KeyboardInterrupt
         if final or degree >= RULES.searched:
@@ -240,19 +241,29 @@ class Continuation:
     def _build_objective(
         self, label: str, family: Family, samples: Samples, mirror: Mirror | None
     ) -> tuple[Objective, Array]:
-        """The loss of a family on samples, and the start in the parameters that it leaves free."""
-        theta, settings = self._embed_last(family), self.settings
-        # Linear families: least squares in their coefficients
+        """The loss of a family on samples, and the start, in the parameters that are free."""
+        settings, theta = self.settings, None
+        if self._reached is not None:
+            # Start from the last result. A basis of higher degree contains the last one
+            theta, before = self._stages[-1].result.theta, self._reached[1]
+            if theta.size != family.size:
+                assert isinstance(family, GradedFamily)
+                assert isinstance(before, GradedFamily)
+                theta = family.embed(theta, before)
+        elif self.begin is not None and isinstance(settings.parametrisation, Polynomial) and self.mirror is None:
+            assert isinstance(family, ProductFamily)
+            theta = self.begin(family)
+        # The loss of linear families is a least-squares problem in their coefficients
         if isinstance(family, LinearFamily):
             objective, start = self._build_in_basis(family, samples, theta, mirror)
             if settings.max_mutual is None:
                 return self.folds.add_to(objective), start
             return bound_mutual_angles(objective, start, settings.max_mutual, self.problem.r, fresh=theta is None)
-        # All others: networks by arrays, anything else by CasADi's graphs
+        # The loss of networks is computed with arrays, that of other families with CasADi graphs
         if settings.max_mutual is not None:
-            expected = "a parametrisation linear in its parameters, such as polynomial"
+            expected = "a family linear in its parameters, such as a polynomial"
             raise InvalidValueError("max_mutual_deg", f"given with {label}", expected)
-        # With the state of the solver
+        # The estimate includes the state of the solver
         numbers = 60 * family.size + 100 * len(samples) * self.space.n
         require_memory(f"{label} with {family.size} parameters", 8.0 * numbers)
         start, single = family.initial(settings.seed) if theta is None else theta, settings.precision == "single"
@@ -264,37 +275,21 @@ class Continuation:
             raise InvalidValueError("precision", f"'single' with {label}", "double, or a basis or a network (mlp)")
         return self.folds.add_to(GraphObjective(family, samples, settings.weights, start, self._draw)), start
 
-    def _embed_last(self, family: Family) -> Array | None:
-        """The last result in a family, (size,); at first that of `begin`, or None if a start has to be found."""
-        if self._reached is None:
-            polynomials = isinstance(self.settings.parametrisation, Polynomial)
-            if self.begin is None or not polynomials or self.mirror is not None:
-                return None
-            assert isinstance(family, ProductFamily)
-            return self.begin(family)
-        # A basis of higher degree contains the last one
-        theta, before = self._stages[-1].result.theta, self._reached[1]
-        if theta.size == family.size:
-            return theta
-        assert isinstance(family, GradedFamily)
-        assert isinstance(before, GradedFamily)
-        return family.embed(theta, before)
-
     def _build_in_basis(
         self, family: LinearFamily, samples: Samples, theta: Array | None, mirror: Mirror | None
     ) -> tuple[BasisObjective, Array]:
-        """The loss of a family that is linear in its parameters, and the start in those that a mirror leaves free."""
+        """The loss of a family that is linear in its parameters, and the start, in the coefficients that are free."""
         kept = None if mirror is None else mirror.kept(family)
         key = family, len(samples), kept is not None
         if theta is None and key not in self._starts:
-            # It does not depend on the seed: eigenvalues are close, so other samples would mix coordinates
+            # Eigenvalues are close, so other samples would mix the coordinates: use the same ones for all seeds
             even = self._sample(len(samples), RULES.start_seed)
             start = find_spectral_start(family, even, kept, self._gradients(family))
-            # Quantities to follow choose among coordinates of equal loss
+            # Among coordinates of equal loss, choose those that follow the quantities
             if self.like is not None:
                 start = self.like.turn(family, start, even, self._gradients(family))
             self._starts[key] = start
-        # The start as components, which a mirror leaves even or odd, and of these the free ones
+        # With a mirror, the start is in even and odd components, and only their free coefficients remain
         if theta is None:
             theta = self._starts[key]
         elif mirror is not None:
@@ -307,7 +302,7 @@ class Continuation:
         return objective, theta
 
     def _family(self, parametrisation: Parametrisation) -> Family:
-        """The family on the active joints: the same object every time, so that what it needs is built once."""
+        """The family on the active joints. The same label gives the same object, so that its functions are reused."""
         label = parametrisation.label
         if label not in self._families:
             self._families[label] = parametrisation.family(self.space, self.r)
@@ -315,7 +310,7 @@ class Continuation:
 
     @cached_property
     def mirror(self) -> Mirror | None:
-        """The symmetry that halves the coefficients; a bound on mutual angles, or a meaning, is met without one.
+        """The mirror symmetry that halves the coefficients; None with `max_mutual_deg` or `like`, or without symmetry.
 
         Of the coordinates that it allows, those with the least loss at degree 3 are chosen.
         """
@@ -326,25 +321,24 @@ class Continuation:
             return mirror
         family = self._family(target.of_degree(min(target.degree, RULES.trial_degree)))
         assert isinstance(family, LinearFamily)
-        return min(mirror.list_choices(), key=lambda choice: self._try(family, choice))
-
-    def _try(self, family: LinearFamily, mirror: Mirror) -> float:
-        """The loss that a family reaches with these symmetric coordinates."""
-        samples = self._sample(self._count_samples(family, mirror.kept(family)), (self.settings.seed, 0))
-        with one_blas_thread():
-            with deferred():
-                objective, start = self._build_in_basis(family, samples, None, mirror)
-            result = GaussNewton().coarser().minimise(objective, start)
-        if result.status is Status.INTERRUPTED:
-            raise KeyboardInterrupt
-        return result.value
+        losses: list[tuple[float, Mirror]] = []
+        for choice in mirror.list_choices():
+            samples = self._sample(self._count_samples(family, choice.kept(family)), (self.settings.seed, 0))
+            with one_blas_thread():
+                with deferred():
+                    objective, start = self._build_in_basis(family, samples, None, choice)
+                result = GaussNewton().coarser().minimise(objective, start)
+            if result.status is Status.INTERRUPTED:
+                raise KeyboardInterrupt
+            losses.append((result.value, choice))
+        return min(losses, key=lambda pair: pair[0])[1]
 
     def _require_memory(self, target: GradedParametrisation) -> None:
-        """Refuse a degree that exceeds the memory, before building anything."""
+        """Refuse a degree that needs more memory than there is, before anything large is built."""
         n, r, half = self.space.n, self.r, 1 if self.mirror is None else 2
         K = target.term_count(n)
         N = self._count_for_basis(K, r) / half
-        # Numbers of the basis at a sample, see `BasisGradients`; they are there twice while they are built
+        # Numbers X of a sample, see `BasisGradients`: they are stored twice while they are built
         of_a_joint = K - target.term_count(n - 1) if n > 1 else K
         numbers = 1 + K if isinstance(target, Polynomial | Fourier) else n * of_a_joint
         gradients = 2 * (4 if self.settings.precision == "single" else 8) * numbers + 4 * n * K / OBJECTIVE_RULES.stride
@@ -353,14 +347,14 @@ class Continuation:
         require_memory(f"{target.label} on {n} joints with {K} basis functions", needed)
 
     def _count_samples(self, family: Family, kept: NDArray[np.bool_] | None) -> int:
-        """Number of samples of a family. A sample of a mirror symmetric problem counts twice."""
+        """Number of samples of a family; half of it if a mirror symmetry halves the coefficients."""
         if not isinstance(family, LinearFamily):
             return self.settings.samples or RULES.network_samples
         count = self._count_for_basis(family.width, family.outputs)
         return count if kept is None or self.settings.samples else ceil(count / 2)
 
     def _count_for_basis(self, terms: int, r: int) -> int:
-        """Number of samples for a linear family, so that there are 70 to 140 residuals per coefficient."""
+        """Samples of a linear family: 70 to 140 residuals per coefficient; up to 8 joints, 1000 samples are added."""
         rows = self.problem.m + r - 1
         if self.problem.n > RULES.many_joints:
             return self.settings.samples or ceil(RULES.residuals_of_many * terms / rows)
@@ -384,13 +378,13 @@ class Continuation:
 
 
 class FoldSearch:
-    """The worst points that were found so far.
+    """Searches coordinates for their worst points, and collects these for the fold term of the next stage.
 
     Args:
         problem: problem of the fit.
         active: joints that are not coordinates themselves.
-        weight: weight of the fold term; with 0 nothing is searched.
-        singular: whether samples of the domain are near singular positions of the task. Folds there are the domain's.
+        weight: weight of the fold term; with 0 there is no search.
+        singular: whether the domain has samples near singular positions of the task, which force folds.
     """
 
     def __init__(self, problem: Problem, active: list[int], weight: float, singular: bool) -> None:
@@ -400,15 +394,15 @@ class FoldSearch:
 
     @property
     def least(self) -> float:
-        """Least conditioning of the last search; 1, the largest there is, without a search."""
+        """Least conditioning that the last search found; 1, the largest possible value, without a search."""
         return 1.0 if self.worst is None else self.worst.least
 
     def give_up(self) -> None:
-        """Forget all points."""
+        """Discard the collected points, so that the fold term is left out."""
         self._points = self._points[:0]
 
     def search(self, stage: Stage, parametrisation: Parametrisation, seed: int, monitor: Monitor) -> None:
-        """Find and collect the worst points of a stage."""
+        """Find the worst points of a stage's coordinates, and collect those of small conditioning."""
         if not self._weight:
             return
         monitor(Progress(stage.label, 1.0, "searching for folds"))
@@ -417,7 +411,7 @@ class FoldSearch:
         fitted = problem.r - len(idle)
         space = JointSpace.of(problem)
         coordinates = Coordinates(parametrisation, space, idle, stage.result.theta, np.zeros(fitted), np.ones(fitted))
-        # Points join before they fold, so that the next stage sees them
+        # Points are collected before they fold, so that the next stage can prevent that
         self.worst = worst_points(problem, coordinates, seed)
         self._points = np.concatenate([self._points, self.worst.below(RULES.collected)])
 
@@ -463,7 +457,7 @@ class FitSettings:
         Raises:
             InvalidValueError, ShapeError: if a setting is invalid, or contradicts another one.
         """
-        # The family, for this problem
+        # Choose the family, and adapt it to the problem
         require_kind("problem", problem, Problem)
         if parametrisation is None:
             parametrisation = choose_parametrisation(problem, bounded=max_mutual_deg is not None)
@@ -471,7 +465,7 @@ class FitSettings:
         bound = parametrisation.for_problem(problem)
         if max_mutual_deg is not None:
             max_mutual_deg = _check_bound(bound, max_mutual_deg)
-        # The solver; only Ipopt knows bounds
+        # The solver: only Ipopt handles the bound on mutual angles
         if solver is None:
             solver = choose_solver(bound, problem) if max_mutual_deg is None else Ipopt()
         if not isinstance(solver, Solver) or isinstance(solver, type):
@@ -483,16 +477,16 @@ class FitSettings:
         require_kind("split_idle", split_idle, bool)
         require_known("precision", precision, PRECISIONS)
         if precision == "single" and max_mutual_deg is not None:
-            raise InvalidValueError("precision", "'single' with max_mutual_deg", "double: Ipopt needs its digits")
+            raise InvalidValueError("precision", "'single' with max_mutual_deg", "double, which Ipopt needs")
         tag = require_count("seed", seed, least=0)
         if like is not None and (max_mutual_deg is not None or bound.closed_form is not None):
             other = bound.label if max_mutual_deg is None else "max_mutual_deg"
-            raise InvalidValueError("like", f"given with {other}", "a fit of the weighted loss")
+            raise InvalidValueError("like", f"given with {other}", "one of them: `like` needs the weighted loss")
         quantities = None if like is None else Like.of(problem, like)
         return cls(bound, solver, loss, count, tag, max_mutual_deg, split_idle, precision, quantities)
 
     def add_term(self, term: LikeTerm) -> Self:
-        """The settings with the term that holds coordinates to quantities among the weights."""
+        """The settings with the loss term of the quantities that coordinates follow."""
         register_loss_term(term)
         return replace(self, weights=replace(self.weights, extra={**self.weights.extra, term.name: LIKE_RULES.weight}))
 
@@ -508,7 +502,7 @@ class FitSettings:
 
 
 def choose_parametrisation(problem: Problem, bounded: bool) -> Polynomial:
-    """Polynomials of degree 5; of 4 with a bound or 8 joints, of 3 with more, of 2 from 12: terms grow too many."""
+    """Polynomials of degree 5; of 4 with a bound or 8 joints, of 3 from 9 joints, of 2 from 12, to limit the terms."""
     fewer = [degree for joints, degree in RULES.lower_degrees if problem.n >= joints]
     return Polynomial(
         degree=min(RULES.degree_with_bound if bounded else RULES.default_degree, *fewer, RULES.default_degree)
@@ -516,7 +510,7 @@ def choose_parametrisation(problem: Problem, bounded: bool) -> Polynomial:
 
 
 def choose_solver(parametrisation: Parametrisation, problem: Problem) -> Solver:
-    """Gauss-Newton for families linear in their parameters, with fewer matrices if these are large; else L-BFGS."""
+    """GaussNewton for families linear in their parameters, QuasiNewton if their matrices are large; else LBFGS."""
     if not parametrisation.linear:
         return LBFGS()
     terms = parametrisation.term_count(problem.n) if isinstance(parametrisation, GradedParametrisation) else 0
@@ -529,7 +523,8 @@ def choose_solver(parametrisation: Parametrisation, problem: Problem) -> Solver:
 
 def _check_bound(parametrisation: Parametrisation, max_mutual_deg: float) -> float:
     if parametrisation.closed_form is not None:
-        raise InvalidValueError("max_mutual_deg", f"given with {parametrisation.label}", "a parametrisation to fit")
+        expected = "a family with parameters to fit"
+        raise InvalidValueError("max_mutual_deg", f"given with {parametrisation.label}", expected)
     bound = as_number("max_mutual_deg", max_mutual_deg)
     if not RULES.least_bound_deg <= bound < 90:
         expected = f"an angle from {RULES.least_bound_deg:g} to below 90 degrees"

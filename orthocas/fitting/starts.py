@@ -1,4 +1,4 @@
-"""Where fits begin: the spectral start of bases, and a second start from the mirrored gradients."""
+"""Where fits begin: the spectral start of bases, and mirror symmetries, which halve the coefficients."""
 
 from dataclasses import dataclass, replace
 from itertools import combinations, permutations, product
@@ -20,7 +20,7 @@ from orthocas.tools.checks import Array
 class StartRules:
     """Numbers of starts and of the search for a mirror."""
 
-    mutual_weight: float = 1.0  #: of coordinates that are found already, beside the task
+    mutual_weight: float = 1.0  #: of gradients along coordinates that are found already, relative to those of the task
     mixing_angle: float = float(np.radians(10))  #: by which neighbours are mixed [rad]
     exact: float = 1e-12  #: squared sine of a leak; functions of an exact coordinate are exact, too
     ridge: float = 1e-10  #: relative; keeps the pencil definite if basis functions coincide on the samples
@@ -44,8 +44,8 @@ def find_spectral_start(
 
     Each coordinate minimises E |Pi_x grad xi|^2 subject to E |grad xi|^2 = 1, with the A-orthogonal projector Pi_x on
     the task gradients. A function of a coordinate xi_j that is already found would be a minimiser too, so each xi_j
-    adds the term E (grad xi_j . grad xi)^2 / |grad xi_j|^2. All products are taken in the metric A^-1. Among equals,
-    such as xi and xi^2 of an exact coordinate, the one with the smallest variance of its gradient comes first.
+    adds the term E (grad xi_j . grad xi)^2 / |grad xi_j|^2. All products are taken in the metric A^-1. Where several
+    minima are zero, as for xi and xi^2 of an exact coordinate, the gradient with the smallest variance is chosen.
 
     Args:
         family: the coordinates.
@@ -72,18 +72,18 @@ def find_spectral_start(
     allowed = np.ones((family.outputs, K), dtype=bool) if kept is None else kept
     C, left = np.zeros(allowed.shape), list(range(family.outputs))
     while left:
-        # One coordinate for all that allow the same coefficients
+        # Coordinates that may have the same coefficients have the same minimum: solve one problem for each such class
         classes = {allowed[j].tobytes(): j for j in reversed(left)}.values()
         j, c = min(((j, _find_smallest(S, T, V, allowed[j])) for j in classes), key=lambda pair: pair[1] @ S @ pair[1])
         left.remove(j)
         C[j] = c
-        # Functions of this coordinate cost as much as what lies along the task
+        # From now on, gradients along this coordinate count like gradients along the task
         gradient = raised @ c  # (N, n)
         length = np.sqrt(np.maximum(np.einsum("sn,sn->s", gradient, G @ c), 1e-300))
         along = np.einsum("sn,snk->sk", gradient / length[:, None], G)
         S = S + RULES.mutual_weight * along.T @ along / N
-    # Coordinates have a mean gradient length of 1. The spectral solution inherits the symmetries of the problem, and a
-    # symmetric point is often a saddle of the loss: neighbours that allow the same coefficients are mixed slightly
+    # Scale the coordinates to a mean gradient length of 1. The spectral solution inherits the symmetries of the
+    # problem, and a symmetric point is often a saddle of the loss: mix neighbours of the same class slightly
     C = C / np.linalg.norm(G @ C.T, axis=1).mean(axis=0)[:, None]
     cos, sin = np.cos(RULES.mixing_angle), np.sin(RULES.mixing_angle)
     for k in np.flatnonzero((allowed[1:] == allowed[:-1]).all(axis=1)):
@@ -92,9 +92,12 @@ def find_spectral_start(
 
 
 def _find_smallest(S: Array, T: Array, V: Array, free: NDArray[np.bool_]) -> Array:
-    """The c with c^T T c = 1 and the smallest c^T S c, zero where it is not free, (K,). Of exact ones that of V."""
+    """The c (K,) with c^T T c = 1 and the smallest c^T S c, and zeros where it is not free.
+
+    If c^T S c is zero for several c, the one with the smallest c^T V c is taken.
+    """
     block = np.ix_(free, free)
-    # Whitening W with W^T T W = I
+    # W with W^T T W = I turns the problem into an ordinary eigenproblem
     whitening = np.linalg.inv(np.linalg.cholesky(T[block])).T
     values, vectors = np.linalg.eigh(whitening.T @ S[block] @ whitening)
     equal = whitening @ vectors[:, : max(1, np.count_nonzero(values < RULES.exact))]
@@ -107,10 +110,11 @@ def _find_smallest(S: Array, T: Array, V: Array, free: NDArray[np.bool_]) -> Arr
 class Mirror:
     """A reflection S = diag(s) of the joints about the centre of the domain that keeps task directions and metric.
 
-    The projector on the task gradients fulfils Pi(S q) = S Pi(q) S, and A(S q) = S A(q) S, with q from the centre. So
-    coordinates with xi_j(S q) = p_j xi_j(q), p_j = +1 or -1, have the same angles at q and at S q. So have coordinates
-    of which two change places, xi_i(S q) = xi_j(q): then (xi_i + xi_j) / sqrt 2 is even and (xi_i - xi_j) / sqrt 2 odd.
-    In both cases the coordinates come from even and odd components, each with half of the coefficients.
+    With q measured from the centre, the projector on the task gradients fulfils Pi(S q) = S Pi(q) S, and the metric
+    A(S q) = S A(q) S. So coordinates with xi_j(S q) = p_j xi_j(q), p_j = +1 or -1, have the same angles at q and at
+    S q. The same holds if S exchanges two coordinates, xi_i(S q) = xi_j(q): then (xi_i + xi_j) / sqrt 2 is even and
+    (xi_i - xi_j) / sqrt 2 is odd. In both cases the coordinates are built from even and odd components, each of which
+    has about half of the coefficients.
     """
 
     space: JointSpace
@@ -119,7 +123,7 @@ class Mirror:
     exchanged: Pairs = ()  #: pairs of an odd and an even component, from which two coordinates are made
 
     def list_choices(self) -> list["Mirror"]:
-        """Mirrors with the same reflection and all choices of what changes places, up to a number of them."""
+        """Mirrors with the same reflection, one for each choice of exchanged pairs, at most eight."""
         odd, even = (np.flatnonzero(self.parities == sign).tolist() for sign in (-1, 1))
         most = min(len(odd), len(even))
         pairs = [
@@ -136,7 +140,7 @@ class Mirror:
         return np.concatenate(coordinates_of(list(rows), self.exchanged))
 
     def components(self, theta: Array) -> Array:
-        """Coefficients of the symmetric components, (r K,), from those of the coordinates."""
+        """Coefficients of the even and odd components, (r K,), from those of the coordinates."""
         rows = theta.reshape(len(self.parities), -1)
         back = tuple((j, i) for i, j in self.exchanged)
         return np.concatenate(coordinates_of(list(rows), back))
@@ -151,7 +155,7 @@ class Mirror:
                 np.array(basis(self.space.centre[:, None] + self.space.half_width[:, None] * side))
                 for side in (u, self.signs[:, None] * u)
             )
-            # Each function is even, odd, or neither
+            # Find which functions are even and which are odd
             size = np.abs(here).max(axis=1)
             even, odd = (np.abs(there - sign * here).max(axis=1) <= RULES.tolerance * size for sign in (1, -1))
             allowed: NDArray[np.bool_] = np.where(even, 1, -1) == self.parities[:, None]
@@ -165,11 +169,14 @@ class Mirror:
 
 
 def find_mirror(problem: Problem, active: list[int]) -> Mirror | None:
-    """The first mirror symmetry of a problem in its active joints, or None."""
+    """The first mirror symmetry of a problem in its active joints; None if there is none, or for more than 12 joints.
+
+    A symmetry is tested at 16 random points.
+    """
     space = JointSpace.of(problem).restricted_to(active)
     if space.n > RULES.most_joints:
         return None
-    # One point excludes most choices of signs, the others the rest
+    # The first point excludes most choices of signs, so that few are left to be tested at the other points
     u = np.random.default_rng(RULES.seed).uniform(-1.0, 1.0, (RULES.points, space.n))
     left = [np.array(signs) for signs in product((1.0, -1.0), repeat=space.n)][1:]
     for points in (u[:1], u[1:]):
@@ -189,24 +196,24 @@ def find_mirror(problem: Problem, active: list[int]) -> Mirror | None:
 
 
 def _evaluate_tensors(problem: Problem, active: list[int], u: Array) -> Array:
-    """The `compute_directions` at points of the cube (N, n)."""
+    """Result of `compute_directions` at points (N, n) of the cube [-1, 1]^n, scaled to the domain."""
     domain = problem.domain
     return compute_directions(problem, active, domain.centre[active] + domain.half_width[active] * u)
 
 
 def _find_parities(problem: Problem, active: list[int], signs: Array, u: Array) -> Array | None:
-    """Parities of r coordinates, odd ones first; None if the null space has other parities elsewhere on the mirror.
+    """Parities of the r components, odd ones first; None if they differ between points of the mirror S q = q.
 
-    The null space of J_x is mapped to itself where S q = q, and trace(S) on it is the number of even coordinates less
+    At such points S maps the null space of J_x to itself, and its trace there is the number of even components minus
     that of odd ones.
     """
-    # On the mirror itself, S maps the null space to itself, and its trace counts parities
+    # trace(S) on the null space is trace(S) minus the trace along the task
     tensors = _evaluate_tensors(problem, active, np.where(signs > 0, u, 0.0))
     inverse, projector = tensors[:, 0], tensors[:, 1]
     along_task = np.einsum("sii,i->s", np.linalg.solve(inverse, projector.transpose(0, 2, 1)), signs)
     differences = signs.sum() - along_task
     r = len(active) - problem.m
-    # A whole number of even coordinates, the same everywhere
+    # The number of even components must be whole, and the same at all points
     even = np.round((r + differences.mean()) / 2)
     if np.abs(2 * even - r - differences).max() > 0.01 or not 0 <= even <= r:
         return None

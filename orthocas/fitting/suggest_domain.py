@@ -1,4 +1,4 @@
-"""`suggest_domain`: the widest box around a posture on which a chart has the quality that is asked."""
+"""`suggest_domain`: the largest box around a posture on which a chart has the required quality."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ from orthocas.tools.json import collect_attributes
 from orthocas.tools.progress import Monitor, Progress, silent
 
 _STAGE = "suggest a domain"
-#: what helps if no box keeps the bounds
+#: what may help if no box keeps the bounds
 REMEDIES = (
     "another home (home=..., --centre or --home), another metric (metric=..., --metric), a larger leak_deg "
     "(--leak-deg) or a smaller conditioning (--conditioning) may help"
 )
-LEAK_DEG, CONDITIONING = RULES.leak_deg, RULES.conditioning  #: what is asked by default
+LEAK_DEG, CONDITIONING = RULES.leak_deg, RULES.conditioning  #: default bounds
 
 Reason = Literal["joint limit", "unlimited", "idle", "cyclic", "leak", "conditioning", "singularity", "half a turn"]
 _WORDS: dict[Reason, str] = {
@@ -65,16 +65,16 @@ def suggest_domain(
     seed: int = 0,
     monitor: Monitor = silent,
 ) -> DomainSuggestion:
-    """The widest box around a posture, inside the joint limits, on which a chart has the quality that is asked.
+    """The largest box around a posture, inside the joint limits, on which a chart has the required quality.
 
     Quadratic charts on trial boxes give leak and conditioning in a fraction of a second. A search over the half-widths
-    of the joints takes the box with the largest volume that keeps both bounds, and a fit confirms it: if the fit misses
-    a bound, or has less than half of the conditioning anywhere that descents reach, the box shrinks by 8 %. Idle and
-    cyclic joints take their whole range. The result is deterministic.
+    of the joints finds the box with the largest volume that keeps both bounds. Then a fit confirms it: if the fit
+    misses a bound, or if descents find a point with less than half of the required conditioning, the box shrinks by
+    8 %. Idle and cyclic joints take their whole range. The result is deterministic.
 
     Args:
         robot: the robot.
-        task: a task of that robot. A missing reference orientation is taken at the home.
+        task: a task of that robot. If it lacks a reference orientation, the one at the home is taken.
         home: centre of the box, (n,) [rad] or [m], or the name of a posture of the robot's files. Default: the first
             named posture that is regular and away from the limits, otherwise the most regular bent posture.
         metric: as in `Problem`.
@@ -93,7 +93,8 @@ def suggest_domain(
         SingularTaskError: if the task is singular everywhere.
         UnknownNameError: if there is no posture of that name.
         InvalidValueError, NotRedundantError: if an argument is invalid.
-        KeyboardInterrupt: after Ctrl-C; `Interrupted` with the fit on the box found, if it comes during a fit.
+        KeyboardInterrupt: after Ctrl-C during the search.
+        Interrupted: after Ctrl-C during the fit on the box found; its `result` is that fit.
 
     Source:
         ours, docs/explanation/domains.md.
@@ -119,7 +120,7 @@ def suggest_domain(
     bounds, loss = Bounds(float(leak_deg), float(conditioning)), Weights.of(weights)
     if parametrisation is not None:
         require_parametrisation(parametrisation)
-    # The problem around the home, and the joints whose half-widths are searched
+    # Build the problem around the home, and find the joints whose half-widths are searched
     posture = find_home(robot, task, home)
     room = np.minimum(_measure_room(robot, posture.q), _bound_widths(robot))
     problem = Problem(robot, task, metric, Box(posture.q, np.minimum(_propose_widths(robot), room)))
@@ -127,7 +128,7 @@ def suggest_domain(
     joints = _Joints.of(problem)
     prober = Prober(problem, joints.active, joints.cyclic, loss)
     stricter = replace(bounds, conditioning=min(1.0, RULES.margin * bounds.conditioning))
-    # The widest box for trial charts, then a fit that confirms it
+    # Find the largest box for trial charts, and confirm it by a fit
     widths, broken = WidestBox(prober, posture.q, room, joints.free, stricter, monitor).search(_propose_widths(robot))
     family = choose_parametrisation(problem, bounded=True) if parametrisation is None else parametrisation
     fit, quality = _confirm(prober, family, joints, widths, bounds, seed, monitor)
@@ -159,7 +160,7 @@ class _Joints:
 
     @property
     def active(self) -> list[int]:
-        """Joints that coordinates are fitted in."""
+        """Joints that fitted coordinates depend on."""
         return [k for k in range(len(self.names)) if k not in self.idle]
 
     @property
@@ -168,16 +169,16 @@ class _Joints:
         return [k for k in self.active if self.names[k] not in self.cyclic]
 
     def describe(self, problem: Problem, broken: Mapping[int, list[Miss]]) -> tuple[JointWidth, ...]:
-        """Half-widths of the problem's domain, with what ends them.
+        """Half-widths of the problem's domain, and the reason that limits each of them.
 
         Args:
             problem: the problem on the suggested domain.
-            broken: the bounds that break if a joint moves further; none for joints that have no room.
+            broken: the bounds that break if a joint moves further; empty lists for joints without room.
         """
         robot, domain = problem.robot, problem.domain
         limited = _measure_room(robot, domain.centre) <= _bound_widths(robot)
         widths = []
-        # The first that applies, of whole ranges, bounds and limits
+        # Whole ranges come before bounds, and bounds before limits
         for k, name in enumerate(self.names):
             reason: Reason = "joint limit" if limited[k] else "unlimited"
             if broken.get(k):
@@ -189,18 +190,21 @@ class _Joints:
 
 
 def _propose_widths(robot: Robot) -> Array:
-    """Half-widths whose proportions a search starts from, (n,)."""
+    """Half-widths (n,), whose proportions the search starts from."""
     return np.where(robot.tree.prismatic, PRISMATIC_ROOM, REVOLUTE_ROOM)
 
 
 def _measure_room(robot: Robot, q: Array) -> Array:
-    """Distances of a posture from the nearest joint limits, (n,)."""
+    """Distances (n,) of a posture from the nearest joint limits [rad] or [m]."""
     room: Array = np.minimum(q - robot.lower, robot.upper - q)
     return room
 
 
 def _bound_widths(robot: Robot) -> Array:
-    """Largest half-widths that a search tries, (n,): a full turn, the joint's own range, or 1 m."""
+    """Largest half-widths (n,) that a search tries.
+
+    Pi for revolute joints [rad]; no bound for slides with limits; 1 m for slides without.
+    """
     endless = np.isinf(robot.lower) | np.isinf(robot.upper)
     return np.where(robot.tree.prismatic, np.where(endless, RULES.longest, np.inf), RULES.farthest)
 
@@ -209,15 +213,16 @@ def _bound_widths(robot: Robot) -> Array:
 class WidestBox:
     """Search for the half-widths with the largest product that keep the bounds.
 
-    From a common scale, rounds of exchange follow: joints whose widening costs little become wider, the others
-    narrower, and the scale returns to the bounds. At the optimum all joints that are free cost the same.
+    First, a common scale of all half-widths is found. Then, in rounds of exchange, joints whose widening costs little
+    become wider, the others narrower, and the scale is adapted until the bounds hold. At the optimum, widening costs
+    the same for all free joints.
 
     Args:
         prober: fits on trial boxes and evaluates them.
         home: centre of the boxes, (n,).
         room: largest half-widths, (n,).
         free: joints to widen. The others have their full room.
-        bounds: what is asked.
+        bounds: bounds to keep.
         monitor: called with progress.
     """
 
@@ -228,13 +233,13 @@ class WidestBox:
     bounds: Bounds
     monitor: Monitor
     probes: int = 0
-    _fraction: float = 0.0  #: of the time of the search, about
-    _next: tuple[float, int] = (0.0, 1)  #: the fraction after some more trials, and about how many they are
+    _fraction: float = 0.0  #: finished part of the search, about, for the monitor
+    _next: tuple[float, int] = (0.0, 1)  #: that fraction at the end of the present step, and trials until then, about
 
     def search(self, unit: Array) -> tuple[Array, dict[int, list[Miss]]]:
         """Half-widths (n,), and for every free joint the bounds that break if it alone becomes a fifth wider.
 
-        The list of a joint is empty if no bound breaks because the joint has no room.
+        The list of a joint is empty if it has no room to become wider.
 
         Args:
             unit: half-widths to start from, (n,); only their proportions count.
@@ -244,13 +249,13 @@ class WidestBox:
         """
         if not self.free:
             return self.room.copy(), {}
-        # Fractions of the search, for the monitor: the first scale, then each round of exchange, then growth
+        # Estimate for the monitor which fraction of the time each step takes
         count, rounds = len(self.free), max(1, RULES.exchanged // len(self.free))
         times = [RULES.first_time, *[count + RULES.next_time] * rounds]
         ends = np.cumsum(times) / (sum(times) + RULES.growth_time * count)
         self._next = ends[0], RULES.trials
         widths, exchange, step = self._scale_to_boundary(unit, RULES.start), None, 1.0
-        # Rounds of exchange: wider where joints cost little, narrower where they cost much
+        # Rounds of exchange: joints that cost little become wider, those that cost much narrower
         for end in ends[1:]:
             self._next = end, count + RULES.trials
             exchange = self._compute_exchange(widths) if exchange is None else exchange
@@ -258,7 +263,7 @@ class WidestBox:
             if np.log(trial[self.free]).sum() > np.log(widths[self.free]).sum():
                 widths, exchange = trial, None
                 continue
-            # The box got smaller: try half of the exchange
+            # If the volume fell, try half of the exchange
             step /= 2
             if step < RULES.least_step:
                 break
@@ -275,7 +280,7 @@ class WidestBox:
         try:
             return self.prober.evaluate(Box(self.home, widths), enough, leap)
         except MetricError:
-            # Links without mass turn freely where their axes are parallel. A box around a regular posture ends there.
+            # A(q) is singular where the axes of links without mass are parallel: the box must not reach such postures
             if widths[self.free].max() < RULES.smallest:
                 raise
             return Quality(0.0, 1.0, self.home, task_value=0.0, turn_value=1.0)
@@ -289,7 +294,7 @@ class WidestBox:
         return max(self.evaluate(widths, leap=True).excess(self.bounds).values())
 
     def _scale_to_boundary(self, unit: Array, scale: float) -> Array:
-        """The widest multiple of half-widths that keeps the bounds."""
+        """The largest multiple of half-widths `unit` (n,) that keeps the bounds, by bisection from a first scale."""
         low, high = 0.0, np.inf
         while high > RULES.close * low:
             widths = self._clip(scale * unit)
@@ -300,7 +305,7 @@ class WidestBox:
             else:
                 high = scale
             if high < RULES.smallest:
-                # Which bound breaks even on a box of these half-widths (n,), and what may help
+                # Report which bound breaks even on this small box
                 quality = self.evaluate(widths)
                 miss = next(iter(quality.excess(self.bounds)))
                 raise DomainError(
@@ -314,7 +319,7 @@ class WidestBox:
         return self._clip(low * unit)
 
     def _compute_exchange(self, widths: Array) -> Array:
-        """How much narrower each joint becomes, as logarithms of factors, (n,): its cost above the mean cost."""
+        """Logarithms (n,) of the factors by which joints become narrower: each one's cost minus the mean cost."""
         costs, here = np.zeros(len(widths)), self._measure_excess(widths)
         open_joints = [k for k in self.free if widths[k] < self.room[k]]
         for k in open_joints:
@@ -324,15 +329,15 @@ class WidestBox:
         return np.clip(costs, -RULES.largest_exchange, RULES.largest_exchange)
 
     def _grow(self, widths: Array) -> tuple[Array, dict[int, list[Miss]]]:
-        """Widen each joint alone while the bounds are kept, and say what breaks then. Its first step may need a fit."""
+        """Widen each joint alone as long as the bounds are kept; returns half-widths and the bounds that break then."""
         broken: dict[int, list[Miss]] = {k: [] for k in self.free}
-        # Joint after joint, in steps that grow while the bounds are kept, and begin small again where they are not
+        # Steps of a joint grow while the bounds are kept, and begin small again after a step that breaks one
         begin = self._fraction
         for done, k in enumerate(self.free, 1):
             self._next = begin + (1 - begin) * done / len(self.free), 2
             before, factor = widths[k], RULES.wider
             while widths[k] < self.room[k]:
-                # The first step too many says what breaks
+                # Only the first step of a joint may need a fit. The smallest step that breaks bounds ends the joint
                 wider = self._widen(widths, k, factor)
                 ratios = self.evaluate(wider, self.bounds, leap=widths[k] > before).excess(self.bounds)
                 misses = [name for name, ratio in ratios.items() if ratio > 1]
@@ -359,7 +364,11 @@ def _confirm(
     seed: int,
     monitor: Monitor,
 ) -> tuple[Fit, Quality]:
-    """A fit that keeps the bounds, and its quality. The box shrinks until there is one."""
+    """Fit on the box, and shrink it until the fit keeps the bounds; returns the fit and its quality.
+
+    Raises:
+        DomainError: if no fit keeps the bounds, after 12 boxes.
+    """
     problem, robot = prober.problem, prober.problem.robot
     unbounded = [k for k in joints.idle if np.isinf(robot.lower[k]) and np.isinf(robot.upper[k])]
     factors = np.where(np.isin(np.arange(robot.n), joints.free), RULES.shrink, 1.0)
@@ -367,8 +376,7 @@ def _confirm(
     for shrinkings in range(RULES.tries):
         box = Box(problem.domain.centre, widths * factors**shrinkings, unbounded)
         trial = Problem(robot, problem.task, problem.metric, box, problem.name)
-        # A fit would take ten times as long to find that
-        # descents see what samples miss
+        # Skip the fit if descents find too small a conditioning: with many coordinates, that is ten times as fast
         if not prober.least(trial, seed + 1) >= enough:
             continue
         fit = fit_from(prober.start_on, trial, parametrisation, prober.weights, seed, monitor)
@@ -386,7 +394,7 @@ def _confirm(
 
 @dataclass(frozen=True)
 class JointWidth:
-    """How wide a suggested box is in one joint, and what ends it.
+    """How wide a suggested box is in one joint, and what limits it.
 
     The reasons "leak", "conditioning", "singularity" and "half a turn" (of the tool, from the reference) name the bound
     that breaks first if this joint alone moves a fifth further. A joint is "unlimited" if it reaches a full turn, or
@@ -405,7 +413,7 @@ class JointWidth:
 
 @dataclass(frozen=True, eq=False, repr=False)
 class DomainSuggestion(Shown):
-    """A domain with the quality that was asked for, and the fit that confirms it; see `suggest_domain`."""
+    """A domain with the required quality, and the fit that confirms it; see `suggest_domain`."""
 
     fit: Fit  #: the fit on the suggested domain
     home: Array  #: the posture, (n,) [rad] or [m]

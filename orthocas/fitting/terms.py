@@ -26,8 +26,8 @@ class LossRules:
     wide_volume: float = 0.5  #: volume that a wide fit asks for at its first samples
     worst_volume: float = 0.3  #: the same once the worst samples have joined, and for networks
     least_volume: float = 0.05  #: over r: bound of the domain of a wide chart, in the identity metric
-    least_in_metric: float = 0.02  #: the same of charts in another metric: gradients orthogonal there lean in this one
-    beyond: float = 2.0  #: over that bound: the volume in the identity metric that is enough beside another metric
+    least_in_metric: float = 0.02  #: the same for charts in another metric, where orthogonal gradients are oblique here
+    beyond: float = 2.0  #: times `least_in_metric`: the volume in the identity metric that wide fits in A = M ask for
     nearly_folded: float = 1e-4  #: volume below which an inverse loses digits
     shortest: float = 1e-12  #: length of a gradient that counts as zero
 
@@ -39,7 +39,7 @@ ANGLES: tuple[Angles, ...] = ("paper", "metric")  #: kinds of angles in the loss
 
 @dataclass(frozen=True)
 class Sizes:
-    """Sizes of a problem, for the loss of one sample."""
+    """Sizes of the matrices in the loss of one sample."""
 
     n: int  #: joints
     m: int  #: task components
@@ -93,7 +93,7 @@ class UnitGradients:
 
     @classmethod
     def of(cls, J: Array, metric_inverse: Array | None) -> UnitGradients:
-        """Those of J_xi (N, r, n) with A^-1 (N, n, n); None for the identity."""
+        """The unit gradients of J_xi (N, r, n) with A^-1 (N, n, n); None for the identity."""
         raised = J if metric_inverse is None else J @ metric_inverse
         lengths = np.sqrt(np.einsum("sji,sji->sj", raised, J))[:, :, None]
         rows = J / lengths
@@ -109,7 +109,7 @@ class UnitGradients:
 
 @runtime_checkable
 class ArrayTerm(LossTerm, Protocol):
-    """A term that arrays evaluate as well: of many coordinates they are faster than expressions, and built at once."""
+    """A term that NumPy arrays can evaluate too: with many coordinates, that is faster than CasADi expressions."""
 
     def by_arrays(self, sizes: Sizes) -> bool:
         """Whether arrays evaluate the term for a problem of these sizes."""
@@ -125,20 +125,20 @@ class ArrayTerm(LossTerm, Protocol):
 
 
 class CosineTerm:
-    """Arrays of a term whose residuals are scaled cosines c_aj = e_a . u_j with the unit gradients in the metric.
+    """Evaluates by arrays a term whose residuals are scaled cosines c_aj = e_a . u_j, with unit gradients u_j.
 
-    d c_aj / dv_j = (e_a - c_aj g_j) / |v_j|.
+    d c_aj / dv_j = (e_a - c_aj g_j) / |v_j|, see `UnitGradients`.
     """
 
-    toward: ClassVar[str] = ""  #: the sample data that are the e_a (N, m, n); by default they are the g_k of others
-    in_metric: ClassVar[bool] = True  #: whether lengths are those of the metric, not Euclidean ones
+    toward: ClassVar[str] = ""  #: name of the sample data with the e_a (N, m, n); if empty, e_a are the other g_k
+    in_metric: ClassVar[bool] = True  #: whether lengths are taken in the metric; otherwise they are Euclidean
 
     def by_arrays(self, sizes: Sizes) -> bool:
         """See `ArrayTerm`."""
         return self.in_metric or sizes.identity_metric
 
     def _list_directions(self, units: UnitGradients, data: Mapping[str, Array]) -> tuple[Array, float]:
-        """The e_a, (N, k, n), and the square of the scale: means over all pairs of task component and coordinate."""
+        """The e_a, (N, k, n), and the squared scale 1 / (number of pairs), which makes the sum of squares a mean."""
         if not self.toward:
             return units.raised, 1 / len(pairs(units.rows.shape[1]))
         return data[self.toward], 1 / (data[self.toward].shape[1] * units.rows.shape[1])
@@ -148,11 +148,11 @@ class CosineTerm:
         directions, scale = self._list_directions(units, data)
         cosines = units.rows @ directions.transpose(0, 2, 1)  # (N, r, k)
         if not self.toward:
-            # No gradient is a pair with itself
+            # A gradient makes no pair with itself
             np.einsum("sjj->sj", cosines)[...] = 0.0
         squares = np.einsum("sja,sja->s", cosines, cosines)
         cosines *= scale
-        # Each pair is there twice
+        # The loss is half the sum. Without `toward`, each pair of coordinates occurs twice
         return squares * (scale / (2 if self.toward else 4)), cosines @ directions
 
     def build_curvatures(self, units: UnitGradients, data: Mapping[str, Array]) -> Iterator[Array]:
@@ -172,7 +172,7 @@ Pairs = tuple[tuple[int, int], ...]  #: rows of J_xi
 
 
 def coordinates_of(rows: Sequence[Any], exchanged: Pairs) -> list[Any]:
-    """Rows with (a + b) / sqrt 2 and (b - a) / sqrt 2 in place of the rows a, b of each pair: a rotation."""
+    """Rows of coordinates from those of components: a, b of each pair become (a + b) / sqrt 2, (b - a) / sqrt 2."""
     turned = list(rows)
     for i, j in exchanged:
         turned[i], turned[j] = (rows[i] + rows[j]) * 0.5**0.5, (rows[j] - rows[i]) * 0.5**0.5
@@ -181,7 +181,7 @@ def coordinates_of(rows: Sequence[Any], exchanged: Pairs) -> list[Any]:
 
 @dataclass(frozen=True)
 class TaskTerm(CosineTerm):
-    """Mean over task components i and coordinates j of the squared cosines of [AS2023] eq. (24), first sum.
+    """Mean of the squared cosines between task component i and coordinate j: [AS2023] eq. (24), first sum.
 
     c_ij = v_x,i^T A^-1 v_xi,j / (|A^-1 v_x,i| |v_xi,j|), Euclidean norms; NaN where a coordinate gradient vanishes.
     """
@@ -202,9 +202,9 @@ class TaskTerm(CosineTerm):
 
 @dataclass(frozen=True)
 class MutualTerm(CosineTerm):
-    """Mean over pairs of coordinates of the squared cosines of [AS2023] eq. (24), second sum. It is empty for r = 1.
+    """Mean of the squared cosines between coordinates i > j: [AS2023] eq. (24), second sum. It is empty for r = 1.
 
-    c_ij = v_xi,i^T A^-1 v_xi,j / (|A^-1 v_xi,i| |v_xi,j|), Euclidean norms, i > j.
+    c_ij = v_xi,i^T A^-1 v_xi,j / (|A^-1 v_xi,i| |v_xi,j|), Euclidean norms.
     """
 
     in_metric: ClassVar[bool] = False
@@ -242,7 +242,7 @@ class LengthTerm:
 
 @dataclass(frozen=True)
 class MetricLengthTerm:
-    """Sum over coordinates of log^2 |dxi_j| with the lengths of the metric: xi is a similar motion everywhere."""
+    """Sum over coordinates of log^2 |dxi_j|, in the metric: a unit of xi is a motion of equal length everywhere."""
 
     name: str = "metric length"
     data: tuple[str, ...] = ("metric_inverse",)
@@ -256,7 +256,7 @@ class MetricLengthTerm:
 
 @dataclass(frozen=True)
 class MetricTaskTerm(CosineTerm):
-    """Mean over a basis of the task gradients and over coordinates of the squared sines of leaks.
+    """Mean over a basis e_a of the task gradients, and over coordinates, of squared components: sin^2 of leaks over m.
 
     With an A-orthonormal basis e_1..e_m of span{grad_A h_i}, s_aj = e_a . v_xi,j / |v_xi,j|_A^-1. The squares of column
     j add up to sin^2 of the leak of coordinate j, which depends neither on the basis nor on the task coordinates.
@@ -282,8 +282,8 @@ class MetricTaskTerm(CosineTerm):
 class SelfMotionTerm:
     """sin^2 of the leak of a single coordinate, 1 - (v . z)^2 / |v|_A^-1^2, with the A-unit self-motion z.
 
-    It is `MetricTaskTerm` times m, for r = 1, with one residual and without a basis of the task gradients: half of the
-    work of descents that need no Gauss-Newton matrix.
+    It equals m times `MetricTaskTerm` for r = 1. With one residual, and without a basis of the task gradients, it takes
+    half of the work where no Gauss-Newton matrix is needed.
     """
 
     name: str = "self-motion"
@@ -301,7 +301,7 @@ class SelfMotionTerm:
 
 @dataclass(frozen=True)
 class MetricMutualTerm(CosineTerm):
-    """Mean over pairs of coordinates of the squared cosines in the metric. It is empty for r = 1.
+    """Mean over pairs of coordinates of squared cosines in the metric. It is empty for r = 1.
 
     c_ij = v_xi,i^T A^-1 v_xi,j / (|v_xi,i|_A^-1 |v_xi,j|_A^-1), i > j.
 
@@ -333,7 +333,7 @@ def metric_lengths(coordinate_jacobian: ca.SX, metric_inverse: ca.SX | None) -> 
 
 
 def average_pairs(cosines: Sequence[ca.SX]) -> ca.SX:
-    """Residuals whose squares add up to the mean of squares, (pairs, 1)."""
+    """Residuals (pairs, 1) whose squares add up to the mean of the squared cosines."""
     rho: ca.SX = (1 / max(1, len(cosines))) ** 0.5 * (ca.vertcat(*cosines) if cosines else ca.SX(0, 1))
     return rho
 
@@ -377,24 +377,16 @@ def volume_hinges(units: UnitGradients, null_basis: Array, bound: float) -> tupl
     D = units.rows @ null_basis
     volume = np.linalg.det(D)
     hinges, cofactors = np.maximum(bound - volume, 0.0), np.zeros(D.shape)
-    # Only where the hinge acts
-    active = np.flatnonzero(hinges > 0)
-    cofactors[active] = -_cofactors(D[active], volume[active])
-    return hinges, cofactors @ null_basis.transpose(0, 2, 1)
-
-
-def _cofactors(D: Array, volume: Array) -> Array:
-    """Cofactors of matrices (N, r, r) with these determinants: det D D^-T, or by singular values next to folds."""
-    folded = np.abs(volume) < RULES.nearly_folded
-    if not folded.any():
-        return volume[:, None, None] * np.linalg.inv(D).transpose(0, 2, 1)
-    cofactors = np.empty(D.shape)
-    cofactors[~folded] = volume[~folded, None, None] * np.linalg.inv(D[~folded]).transpose(0, 2, 1)
-    U, s, Vt = np.linalg.svd(D[folded])
-    sign = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
-    others = np.stack([np.delete(s, k, axis=1).prod(axis=1) for k in range(D.shape[1])], axis=1)
-    cofactors[folded] = sign[:, None, None] * (U * others[:, None, :]) @ Vt
-    return cofactors
+    # Where the hinge acts, the cofactors are det D D^-T; next to folds, singular values give them
+    near = np.abs(volume) < RULES.nearly_folded
+    regular, folded = np.flatnonzero((hinges > 0) & ~near), np.flatnonzero((hinges > 0) & near)
+    cofactors[regular] = volume[regular, None, None] * np.linalg.inv(D[regular]).transpose(0, 2, 1)
+    if len(folded):
+        U, s, Vt = np.linalg.svd(D[folded])
+        sign = np.sign(np.linalg.det(U) * np.linalg.det(Vt))
+        others = np.stack([np.delete(s, k, axis=1).prod(axis=1) for k in range(D.shape[1])], axis=1)
+        cofactors[folded] = sign[:, None, None] * (U * others[:, None, :]) @ Vt
+    return hinges, -cofactors @ null_basis.transpose(0, 2, 1)
 
 
 @dataclass(frozen=True)

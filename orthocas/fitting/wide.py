@@ -46,7 +46,7 @@ from orthocas.robots.robot import Robot
 from orthocas.robots.tree import require_driven
 from orthocas.solvers.protocol import Status
 from orthocas.tasks.branches import RULES as BRANCH_RULES
-from orthocas.tasks.branches import Branch, Branches, branches, build_clear_box, sample_centres, sample_nonsingular
+from orthocas.tasks.branches import Branch, branches, build_clear_box, sample_centres, sample_nonsingular
 from orthocas.tasks.domains import Box
 from orthocas.tasks.metric import Metric, MetricSpec
 from orthocas.tasks.problem import Problem, check
@@ -88,87 +88,89 @@ def fit_wide(
     w is 0.3 with A = I and 1 otherwise, a_j(q) the leak of coordinate j, b_jk the angle between the gradients of two
     coordinates. v(q) is the volume of coordinates: det of an orthonormal basis of the task's gradients and of the unit
     gradients of xi, all in the metric. Coordinates are regular where v is not zero; for r = 1 it is the cosine between
-    the gradient and the self-motion. With another metric than the identity, the same term for the volume in the
-    identity metric and a small t joins. The first term keeps coordinates regular, the next ones make them as orthogonal
-    as that permits. l_j(q) is the length of the gradient of xi_j, L_j its mean where the descent begins: xi is a
-    similar motion everywhere. Half of the samples are uniform, of networks 70 %, the others boundary-weighted. The
-    numbers are those of `orthocas.fitting.wide_search.WideRules`.
+    the gradient and the self-motion. With another metric than the identity, the same term with the volume in the
+    identity metric and a small t is added. The first term keeps coordinates regular, the next ones make them as
+    orthogonal as that permits. l_j(q) is the length of the gradient of xi_j, and L_j its mean where the descent begins;
+    the last term makes a unit of xi a motion of similar length everywhere. Half of the samples are uniform (70 % for
+    networks), the others boundary-weighted. The numbers are those of `orthocas.fitting.wide_search.WideRules`.
 
     Families are tried until one leaves out little of the branch:
 
-    1. Under a whole pose or orientation, those without the last joint, and before them those without the first one too,
-       if it can turn fully. Then xi stays while base or tool turn about their own axes. With r = 1 they are small
-       networks, which lean less into the task than polynomials but have no proof in a useful time; with several
-       coordinates or `like`, polynomials.
+    1. If the task is a whole pose or orientation, families that do not depend on the last joint. Before these, if the
+       first joint can turn fully, families that depend neither on the first nor on the last one. Then xi stays constant
+       while base or tool turn about their own axes. With r = 1 these are small networks, which leak less than
+       polynomials but cannot be certified in a useful time; with several coordinates or `like`, they are polynomials.
     2. Polynomials linear in each joint on whose position self-motions do not depend, such as the first and the last
-       one. They are best to prove, and hold at any turn of these joints.
-    3. Polynomials in all joints, and a network, as on arms whose axes pass each other at a distance. It takes several
-       times as long to evaluate, and is not tried with `like` or with slides without limits.
+       one. They are the easiest to certify, and hold at any turn of these joints.
+    3. Polynomials in all joints, and a network, for arms whose axes do not meet. The network takes several times as
+       long to evaluate, and is not tried with `like` or with slides without limits.
 
-    Polynomials descend with L-BFGS from linear coordinates across the task at the centre of the branch; networks with
-    Adam from a random start, or from the result of A = I in another metric with r = 1. The best ones go on: as long as
-    they are not regular enough at other samples, and get better, the worst of many fresh samples join. Once they are,
-    leaks weigh more in a last descent, kept if coordinates stay regular enough.
+    Polynomials descend with L-BFGS from linear coordinates across the task at the centre of the branch. Networks
+    descend with Adam from a random start or, in another metric than the identity with r = 1, from the result of A = I.
+    Then the best family is improved: as long as coordinates are not regular enough at held-out samples and get better,
+    the worst of many fresh samples join the loss. Once they are regular enough, a last descent gives leaks more weight;
+    its result is kept if it stays regular enough.
 
-    The best result is kept: regular at the centre, with the fewest bad positions, then with the largest 1 % quantile of
-    the volume. The domain of the chart is the part of the branch where coordinates are regular with a margin in the
-    identity metric, see `RegularPart`. With polynomials in all joints or networks, a joint without limits has one turn
-    in which samples lie; beyond it, positions belong to the domain as far as coordinates are regular there.
+    Results are ranked by regularity at the centre, then by the fewest bad positions, then by the largest 1 % quantile
+    of the volume. The domain of the chart is the part of the branch where coordinates are regular with a margin in the
+    identity metric, see `RegularPart`. With polynomials in all joints or networks, samples of a joint without limits
+    lie in one turn; beyond it, positions belong to the domain wherever coordinates are regular.
 
-    If r joints do not move the task at all, such as the last one under a tool with an axis, they are the coordinates,
-    exact everywhere, unless `parametrisation` or `like` is given. Singular positions then divide the branch once more,
-    by the sign of det of the other joints' columns. The chart is on the centre's side.
+    If r joints do not move the task at all, such as the last one under a tool with an axis, these joints are the
+    coordinates, exact everywhere, unless `parametrisation` or `like` is given. Singular positions then divide the
+    branch once more, by the sign of det of the other joints' columns. The chart is on the side of the centre.
 
-    `regular_share` is of the branch: of all its positions that `branches` counts as clear, the fraction in the domain.
-    If the chart leaves out the other side, or can only serve a smaller box, `left_out` and a BranchWarning say so.
+    `regular_share` is the fraction of the branch's positions that lie in the domain, of those that `branches` counts as
+    clear. If the chart leaves out the other side, or only covers a smaller box, `left_out` and a BranchWarning say so.
 
     Wide charts hold on most of what the arm reaches without passing a singular position, but their leaks are large, 8
-    to 60 degrees on the arms that were measured. They serve inverse kinematics, closed loops, trackers and laws with
-    the whole inertia, best with A = M; see `fit` for decoupled control. That det J keeps its sign does not mean that
-    phi is one-to-one.
+    to 60 degrees on the arms that were measured. Use them for inverse kinematics, closed loops, trackers and laws with
+    the whole inertia, best with A = M; see `fit` for decoupled control. A constant sign of det J does not mean that phi
+    is one-to-one.
 
     Args:
         robot: the robot.
-        task: a task of that robot. A missing reference orientation is taken at the centre of the branch.
-        branch: a branch of `orthocas.branches`, its name, or a box of your own. Default: the branch of the home; with
-            none there, the largest. If its middle is not clear, signs and references begin at `domain.home`, the clear
-            position with the most room. If coordinates then leave out much, the largest box around it may take the
-            place of the branch, see `left_out`.
+        task: a task of that robot. If it lacks a reference orientation, the one at the centre of the branch is taken.
+        branch: a branch of `orthocas.branches`, its name, or a box of your own. Default: the branch of the home
+            posture; the largest one if the home lies in none. If the centre of the branch is not clear, its place is
+            taken by `domain.home`, the clear position with the most room around it. If coordinates then leave out much
+            of the branch, the largest box around `domain.home` may replace it, see `left_out`.
         metric: as in `Problem`.
         clearance: least relative singular value of the task, > 0; see `orthocas.ClearBox`.
-        parametrisation: a family, as in `fit`. Those that are not linear in their parameters descend like networks;
-            those without parameters, such as `SEW` or `Given`, are taken as they are.
-            Default: the first of those above that leaves out little.
-        home: posture whose branch is meant, (n,) or its name. Default: as for `suggest_domain`.
-        like: what coordinates are to be, or to be like: a function of an SX column q, the name of a joint, or "swivel",
-            the angle of the elbow about the line from shoulder to wrist [rad]; with r > 1, several, or a task of lower
-            priority. r quantities that are regular nearly everywhere are the coordinates themselves, see `exact`.
-            Otherwise the first coordinates follow them: the loss holds their gradients against those of the quantities
-            along self-motions, at all samples. Default: none; with shoulder, elbow and wrist and r = 1, xi gets the
-            scale and the direction of the swivel.
+        parametrisation: a family, as in `fit`. Families that are not linear in their parameters are fitted like
+            networks; families without parameters, such as `SEW` or `Given`, are taken as they are. Default: the first
+            of those above that leaves out little.
+        home: a posture (n,) or its name, whose branch is taken. Default: as for `suggest_domain`.
+        like: quantities that the coordinates are, or follow: a function of an SX column q, the name of a joint, or
+            "swivel", the angle of the elbow about the line from shoulder to wrist [rad]; with r > 1, several, or a task
+            of lower priority. If r quantities are regular nearly everywhere, they are the coordinates, see `exact`.
+            Otherwise the first coordinates follow them: the loss holds their gradients to those of the quantities,
+            mainly along self-motions, at all samples. Default: none; then on arms with shoulder, elbow and wrist and
+            r = 1, xi gets the scale and the direction of the swivel.
         exact: whether xi is the quantity itself, xi = y(q), on the part of the branch where it is regular. With True it
-            is, however small the part; with False it never is. Default: where the part has 99.5 % of the nonsingular
-            positions, if no `parametrisation` is given. A parametrisation without parameters, such as `SEW` or
-            `Given`, is a quantity that is taken with True. Nothing is fitted then, so `weights` and `samples` do not
-            count.
-        weights: weights of terms that join the loss, such as `{"name": 0.1}` for a term of `register_loss_term`; or
-            `Weights`, which also take the place of those of leaks and mutual angles: `Weights(task=10.0, mutual=1.0)`.
-            They are weights of angles in the metric by default; without them, task is 2 m w and mutual 0.3.
-            They are means over the first samples; the worst ones of polynomials only ask for regular coordinates. A
-            search for folds has no place here. Default: none.
-        samples: number of samples. Default: 30 for each function, 5,000 to 20,000; 100,000 for a network.
-        seed: seed of the samples, and of the first network.
-        collisions: whether the arm may leave postures in self-collision aside, by `robot.collisions`: their samples
-            do not count, neither in the loss nor in `regular_share`, which is that of the free part. Chart files hold
-            the solids then, and `evaluate` measures free postures.
+            is, even if the part is small; with False it never is. Default: it is if the part has 99.5 % of the
+            nonsingular positions, and no `parametrisation` is given. A parametrisation without parameters, such as
+            `SEW` or `Given`, counts as such a quantity with True. Then nothing is fitted, and `weights` and `samples`
+            have no effect.
+        weights: weights of terms that are added to the loss, such as `{"name": 0.1}` for a term of
+            `register_loss_term`; or `Weights`, which also replace those of leaks and mutual angles:
+            `Weights(task=10.0, mutual=1.0)`. Their angles are in the metric by default, where task 2 m w and mutual 0.3
+            would be the usual weights. With polynomials, they act at the first samples only, because the worst samples
+            only serve regularity. The weight of folds has no effect. Default: none.
+        samples: number of samples. Default: 30 for each basis function, but 5,000 to 20,000; for networks 100,000, or
+            50,000 if they leave out joints.
+        seed: seed of the samples, and of the parameters with which networks begin.
+        collisions: whether to leave out postures in self-collision, by `robot.collisions`. Their samples count neither
+            in the loss nor in `regular_share`, which is that of the free part. Chart files then hold the solids, and
+            `evaluate` measures free postures.
         monitor: called with progress.
 
     Returns:
         The chart, the branch, and the regular share.
 
     Raises:
-        DomainError: if no position of the branch is clear by 1.5 times `clearance`, or if coordinates are not regular
-            in the middle with the sign that they have on most of the branch; with `exact`, not in the middle.
+        DomainError: if no position of the branch has a relative singular value of 1.5 times `clearance`; or if
+            coordinates fold at the centre, or have another sign there than on most of the branch.
         InvalidValueError, UnknownNameError, NotRedundantError: if an argument is invalid.
         Interrupted: after Ctrl-C, once there are coordinates; before that, KeyboardInterrupt.
 
@@ -196,8 +198,15 @@ def fit_wide(
     require_kind("collisions", collisions, bool)
     solids = robot.collisions if collisions else None
 
-    # Positions of the branch that count for its share, and the posture at which xi has the value of its quantity
-    chosen = _choose_branch(robot, task, branch, home)
+    # The branch, the posture at which xi equals its quantity, and clear positions that measure the regular share
+    if isinstance(branch, Branch):
+        chosen = branch
+    elif isinstance(branch, Box):
+        chosen = Branch("box", branch, branch.centre, float("nan"), float("nan"))
+    else:
+        # Default: the branch of the home posture, or the largest one
+        parts = branches(robot, task)
+        chosen = parts[branch] if branch is not None else parts.of(find_home(robot, task, home).q) or parts[0]
     posture = chosen.posture if home is None else find_home(robot, task, home).q
     counted = sample_nonsingular(robot, task, chosen.box, RULES.held_out, (seed, RULES.counted_tag))
     counted = counted if solids is None else counted[solids.check_free(counted)]
@@ -210,7 +219,7 @@ def fit_wide(
         solution = _solve_at_once(problem, quantities, parametrisation, wanted, counted, seed)
         if solution is not None:
             return finish(solution, settings=settings, interrupted=pressed())
-        # Families to try; the domain of each covers all positions of its cyclic joints
+        # The families to try. The domain of each covers all positions of its cyclic joints
         families = _choose_families(problem, like) if parametrisation is None else (parametrisation,)
         searches = [Search(*_prepare(problem, family, like), settings) for family in families]
         try:
@@ -230,7 +239,7 @@ def fit_wide(
 
 
 def _check_weights(weights: Weights | Mapping[str, float]) -> Weights | Mapping[str, float]:
-    """Weights of terms that join the loss; those of angles are of leaks, and of mutual angles in the metric."""
+    """Check weights of terms that are added to the loss. The default angles of `Weights` are those in the metric."""
     if isinstance(weights, Weights):
         return replace(weights, angles=weights.angles or "metric")
     require_kind("weights", weights, Mapping)
@@ -239,25 +248,13 @@ def _check_weights(weights: Weights | Mapping[str, float]) -> Weights | Mapping[
     return Weights(extra=weights).extra
 
 
-def _choose_branch(robot: Robot, task: Task, branch: Branch | Box | str | None, home: ArrayLike | str | None) -> Branch:
-    """The branch itself, by its name, or that of the home."""
-    if isinstance(branch, Branch):
-        return branch
-    if isinstance(branch, Box):
-        return Branch("box", branch, branch.centre, float("nan"), float("nan"))
-    parts: Branches = branches(robot, task)
-    if branch is not None:
-        return parts[branch]
-    return parts.of(find_home(robot, task, home).q) or parts[0]
-
-
 def _build_problems(
     robot: Robot, task: Task, metric: Metric | MetricSpec, branch: Branch, clearance: float
 ) -> tuple[Problem, ...]:
     """The problem on the clear part of a branch.
 
-    If its middle is not clear, its home is the clear position with the most room around it. The box around this
-    position is a second problem, because a singular middle may part the branch.
+    If its centre is not clear, the home of the problem is the clear position with the most room around it. A second
+    problem then has the box around this position, because singular positions at the centre may divide the branch.
     """
     box = branch.box
 
@@ -270,17 +267,17 @@ def _build_problems(
         return (build(box),)
     except DomainError:
         points, values = sample_centres(robot, task, box)
-    # Of the clear positions, the one with the most room around it
+    # Find the clear position with the most room around it
     clear = points[values > BRANCH_RULES.of_centre * clearance]
     room = box.half_width - np.abs(clear - box.centre)
     if not len(clear):
-        missing = f"no position clear by {BRANCH_RULES.of_centre * clearance:g}"
-        most = f"at most {math.floor(1e3 * float(values.max()) / BRANCH_RULES.of_centre) / 1e3:g} can serve it"
-        raise DomainError(f"branch '{branch.name}' has {missing}, expected one for clearance = {clearance:g}: {most}")
+        missing = f"no position with a relative singular value of {BRANCH_RULES.of_centre * clearance:g}"
+        most = f"clearance can be {math.floor(1e3 * float(values.max()) / BRANCH_RULES.of_centre) / 1e3:g} at most"
+        raise DomainError(f"branch '{branch.name}' has {missing}, which clearance = {clearance:g} needs: {most}")
     best = int(np.argmax(np.log(room).sum(axis=1)))
     home, half_width, centre = clear[best], room[best], box.centre.copy()
     smaller = build(Box(home, half_width, box.unbounded))
-    # A smaller box leaves nothing out of joints without limits; these have their turn around the home
+    # Joints without limits lose nothing in a smaller box: their box is one turn, placed around the home
     if {*np.flatnonzero(half_width < box.half_width)} <= {*box.unbounded}:
         return (smaller,)
     centre[list(box.unbounded)] = home[list(box.unbounded)]
@@ -288,7 +285,7 @@ def _build_problems(
 
 
 def _fit_most(problems: tuple[Problem, ...], fit_on: Callable[[Problem], WideFit]) -> WideFit:
-    """The chart of the whole branch; of a smaller box, if its middle is singular and this is regular on more of it."""
+    """The chart of the whole branch, or that of the smaller box if there is one and it is regular on more of it."""
     whole, *smaller = problems
     try:
         result = fit_on(whole)
@@ -302,16 +299,17 @@ def _fit_most(problems: tuple[Problem, ...], fit_on: Callable[[Problem], WideFit
 
 
 def _choose_families(problem: Problem, like: Likeness | None) -> tuple[Polynomial | MLP, ...]:
-    """Under a pose, families without the turn of the tool; first without that of the base, too, if it can turn fully.
+    """The families to try, in this order.
 
-    These are small networks for one coordinate, and polynomials for several, or if they are to mean something.
-
-    Then come polynomials that are linear in the joints on whose position the self-motions do not depend, by proof. Then
-    those that are so in such slides without limits only, if there are others: a joint that turns has one turn.
-    Then a network, but not for coordinates that are to mean something, nor with slides without limits.
+    1. Under a pose: families that leave out the joints that turn the base and the tool, then those that only leave out
+       the tool's. They are small networks for r = 1 without `like`, else polynomials.
+    2. Polynomials that are linear in the joints on whose position self-motions provably do not depend.
+    3. If these include other joints than slides without limits: polynomials that are linear in such slides only. A
+       revolute joint without limits then has one turn.
+    4. A network, without `like` and without such slides.
     """
     robot = problem.robot
-    # Joints that may enter linearly, and those of them that must, since they have no ends
+    # Joints that may enter linearly, and those that must: slides without limits
     free = [k for k in range(robot.n) if keeps_self_motions(problem, k)]
     slides = robot.tree.prismatic
     endless = [k for k in free if slides[k] and np.isinf(robot.lower[k]) and np.isinf(robot.upper[k])]
@@ -326,7 +324,7 @@ def _choose_families(problem: Problem, like: Likeness | None) -> tuple[Polynomia
         if len(linear) + len(without) >= robot.n - problem.r:
             continue
         if like is None and problem.r == 1:
-            # A joint with limits enters a network like others: linear in it, coordinates lean by up to 13 degrees more
+            # Networks linear in a joint with limits have leaks up to 13 degrees larger, so only unlimited joints are
             unlimited = tuple(name for name in linear if np.isinf(robot.upper[robot.joint_names.index(name)]))
             families.append(replace(RULES.small_network, cyclic=unlimited, without=without))
         else:
@@ -340,17 +338,21 @@ def _choose_families(problem: Problem, like: Likeness | None) -> tuple[Polynomia
 
 
 def _prepare(problem: Problem, family: Parametrisation, like: Likeness | None) -> tuple[Problem, Parametrisation]:
-    """A problem and a family that suit each other."""
+    """The family for the problem, and the problem with all positions of joints that are cyclic for the family.
+
+    Raises:
+        InvalidValueError: if the family has no parameters, or is not linear in them with `like`.
+    """
     require_parametrisation(family)
     family = family.for_problem(problem)
     if isinstance(family, CyclicParametrisation):
-        # A family that does without joints that turn tool or base is regular at any turn of them, or at none
+        # A left-out joint that turns tool or base does not change regularity, so it may have any position
         names, task = problem.robot.joint_names, problem.task
         left_out = ((name, names.index(name)) for name in list_left_out(family) if name in names)
         free = (name for name, k in left_out if turns_tool(task, k) or keeps_self_motions(problem, k))
         problem = widen_over_cyclic_joints(problem, (*family.cyclic, *free))
     if family.closed_form is not None:
-        expected = "one that is fitted, such as a polynomial or an MLP, or one without parameters, such as Given"
+        expected = "a family to fit, such as a polynomial or an MLP, or one without parameters, such as Given"
         raise InvalidValueError("parametrisation", family.label, expected)
     if like is not None and not isinstance(family.family(JointSpace.of(problem), problem.r), LinearFamily):
         raise InvalidValueError("parametrisation", family.label, "one that is linear in its parameters, for like")
@@ -366,7 +368,7 @@ def _solve_at_once(
     counted: Array,
     seed: int,
 ) -> WideSolution | None:
-    """Coordinates that need no fit: quantities, or joints that do not move the task; None if there are none."""
+    """Coordinates that need no fit: quantities, or joints that do not move the task. None if a fit is needed."""
     coordinates: Coordinates | None
     if quantities is not None:
         coordinates = take_exactly(problem, quantities, exact, counted)
@@ -396,10 +398,10 @@ def _finish(
     if solution.misses_centre:
         if interrupted:
             raise KeyboardInterrupt
-        wrong = f"in the middle of branch '{branch.name}', coordinates fold or have another sign than on most of it"
+        wrong = f"at the centre of branch '{branch.name}', coordinates fold or have another sign than on most of it"
         raise DomainError(f"{wrong}: give a smaller box as branch, another branch, or another parametrisation")
     coordinates, quantities, meaning = _name_coordinates(solution, settings, posture)
-    # The domain is where coordinates are regular; how much of the branch that is, and how good they are there
+    # The domain is where coordinates are regular. Measure its share of the branch, and the errors of the meaning
     domain = RegularPart(clear.domain, coordinates, find_least_volume(clear))
     problem = Problem(clear.robot, clear.task, clear.metric, domain, clear.name)
     share = float(domain.contains(counted).mean()) if len(counted) else float("nan")
@@ -439,11 +441,13 @@ def _finish(
 
 
 def _bound_leak(problem: Problem, without: Sequence[str], seed: int) -> float:
-    """Bound of the rms leak of one coordinate that does not depend on some joints S [deg]; 0 if nothing is known.
+    """Lower bound of the rms leak of any coordinate that does not depend on joints S [deg]; 0 for r > 1 or without S.
 
-    Of gradients v with v_S = 0, the nearest one to the self-motion z has the leak a, and none has a smaller one::
+    Every gradient v with v_S = 0 has at least the leak a, where z is the self-motion::
 
         sin^2 a = (A z)_S^T (A_SS)^-1 (A z)_S / z^T A z        (A = I and the last joint: sin a = |z_n| / |z|)
+
+    The rms is taken over samples of the domain.
     """
     if not without or problem.r > 1:
         return 0.0
@@ -460,9 +464,10 @@ def _bound_leak(problem: Problem, without: Sequence[str], seed: int) -> float:
 def _name_coordinates(
     solution: WideSolution, settings: WideSettings, posture: Array
 ) -> tuple[Coordinates, Like | None, dict[str, str]]:
-    """Coordinates with scale, order and signs; the quantities that they are, or are like; and the note that says so.
+    """Coordinates with scale, order and signs; the quantities that they are or follow; and notes that say so.
 
-    Fitted ones have the units of their quantities, or of the swivel if that suits, or else the gauge of `fit`.
+    Fitted coordinates have the units of their quantities; without these, the scale of the swivel if xi follows it well
+    enough; else scale, order and signs as in `fit`.
     """
     problem, raw, quantities, seed = solution.problem, solution.coordinates, settings.quantities, settings.seed
     if not raw.size:
@@ -479,15 +484,15 @@ def _name_coordinates(
 
 
 def _describe_left_out(problem: Problem, branch: Branch, counted: Array, share: float) -> str:
-    """Describe what a chart leaves out of a branch, judged by its clear positions (N, n); empty if that is little."""
+    """Describe what a chart leaves out of a branch, from clear positions (N, n) of it; empty if it is nothing."""
     domain, reasons = problem.domain, []
     if share < RULES.divided and not np.array_equal(domain.home, domain.centre):
-        reason = "its middle is not clear, and coordinates have one direction on a part of it only"
+        reason = "its centre is not clear, and coordinates have one direction on a part of it only"
         return f"all but {percent(share)} of the clear positions: {reason}"
     inside = np.asarray(Box(domain.centre, domain.half_width, domain.unbounded).contains(counted))
     if not inside.all():
         box = f"around q = ({number_list(domain.centre)}) with half-widths ({number_list(domain.half_width)})"
-        reasons.append(f"its middle is not clear, so the chart has a smaller box, {box}")
+        reasons.append(f"its centre is not clear, so the chart has a smaller box, {box}")
     beside = is_on_side_of_centre(problem, counted)
     if not beside.all():
         reasons.append("singular positions divide it, so the chart has one side of them")
@@ -500,10 +505,10 @@ class WideFit(Fit):
     """A chart of a branch, and how it was found."""
 
     branch: Branch
-    regular_share: float = float("nan")  #: of the clear positions of the branch, the share in the domain, from samples
-    left_out: str = ""  #: what the fit left out of the branch from the start, and why
-    meaning: MeaningError | None = None  #: how far xi is from what it is like, for r = 1
-    least_leak: float = 0.0  #: no coordinate without the joints that this one leaves out has a smaller leak, rms [deg]
+    regular_share: float = float("nan")  #: share of the branch's clear positions that lie in the domain, from samples
+    left_out: str = ""  #: what the chart leaves out of the branch by its construction, and why
+    meaning: MeaningError | None = None  #: how far xi is from the quantity that it follows, for r = 1
+    least_leak: float = 0.0  #: least rms leak of any coordinate that leaves out the same joints [deg]
 
     def facts(self) -> dict[str, str]:
         """The facts of a fit, with branch and regular share."""

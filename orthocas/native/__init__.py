@@ -1,6 +1,6 @@
-"""C that Python compiles for itself: kernels from CasADi functions, and shared libraries that are kept and loaded.
+"""C that orthocas compiles for its own use: kernels from CasADi functions, and shared libraries that are stored.
 
-`kernels` writes CasADi functions as C99 and fills templates in, and `libraries` compiles, keeps and loads.
+`kernels` writes CasADi functions as C99 and fills in templates; `libraries` compiles, stores and loads libraries.
 `runtime/self_motion.c` follows the self-motion curves of a task value; `orthocas.charts` and `orthocas.arms` call it.
 """
 

@@ -1,4 +1,4 @@
-"""C as text: kernels from CasADi functions, with work arrays on the stack, and templates around them."""
+"""C code from CasADi functions, with work arrays on the stack of the caller, and templates for the code around it."""
 
 from __future__ import annotations
 
@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from jinja2 import Environment
     from jinja2.runtime import Context
 
-LARGE_INVERSE = "large_inverse"  #: name of the functions for which generated C has code of its own
+LARGE_INVERSE = "large_inverse"  #: name of functions whose C code comes from a template
 ROOT_TIMES = "root_times"  #: likewise
-ROUNDS = 8  #: accurate to rounding up to a condition number of 1e6 (tests/control/test_control_algebra.py)
+ROUNDS = 8  #: of a root; exact to rounding up to a condition number of 1e6 (tests/control/test_control_algebra.py)
 
 _INFINITIES = {np.inf: "INFINITY", -np.inf: "-INFINITY"}
 _VERSION = f"by CasADi {ca.CasadiMeta.version()}"
@@ -43,7 +43,7 @@ class Kernels:
     prefix: str
 
     def sizes(self) -> dict[str, dict[str, int]]:
-        """These lengths for templates, at least 1: `work.NAME.arg`, `.res`, `.iw`, `.w` and `.numbers`."""
+        """The lengths in `work` and `numbers` for templates, at least 1, by function name and array name."""
         words = ("arg", "res", "iw", "w", "numbers")
         return {
             name: {word: max(1, size) for word, size in zip(words, (*sizes, self.numbers[name]), strict=True)}
@@ -51,19 +51,31 @@ class Kernels:
         }
 
     def declare_arrays(self, name: str, numbers: str = "", integers: str = "") -> str:
-        """C that declares the arrays of a call of a function, and with them further numbers and integers."""
+        """C that declares the arrays for a call of a function.
+
+        Args:
+            name: name of the function.
+            numbers: further doubles to declare, such as ", a, b".
+            integers: further ints to declare.
+        """
         arg, res, iw, w = (max(1, size) for size in self.work[name])
         lines = f"const double *arg[{arg}] = {{0}};", f"double *res[{res}] = {{0}};"
         return "\n  ".join([*lines, f"double w[{w}]{numbers};", f"int iw[{iw}]{integers};"])
 
     def write_call(self, name: str, inputs: list[str], outputs: list[str]) -> str:
-        """C that calls a function with such arrays, for the places of its inputs and outputs."""
+        """C that calls a function with the arrays of `declare_arrays`.
+
+        Args:
+            name: name of the function.
+            inputs: C expressions for the addresses of its inputs.
+            outputs: C expressions for the addresses of its outputs.
+        """
         lines = [f"arg[{i}] = {place};" for i, place in enumerate(inputs)]
         lines += [f"res[{i}] = {place};" for i, place in enumerate(outputs)]
         return "\n  ".join([*lines, f"{self.prefix}_{name}(arg, res, iw, w, 0);"])
 
     def array_bytes(self, name: str, number_size: int) -> int:
-        """Size of the work arrays that a call of a function needs, with numbers of a size, in bytes."""
+        """Size of the work arrays that a call of a function needs [bytes], with numbers of `number_size` bytes."""
         arg, res, iw, w = self.work[name]
         return 8 * (arg + res) + number_size * w + 4 * iw
 
@@ -79,34 +91,34 @@ def generate_kernels(functions: list[ca.Function], prefix: str) -> Kernels:
     generator = ca.CodeGenerator("kernels.c", {"with_header": False, "with_export": False, "casadi_int": "int"})
     for function in functions:
         generator.add(function)
-    # CasADi passes the sizes of dense products; compilers vectorise those with constant sizes.
+    # Replace CasADi's dense products, which take sizes as arguments: compilers vectorise loops of constant length.
     text = generator.dump()
     sizes = sorted({result.group(2, 3, 5) for result in _PRODUCT.finditer(text)})
     calls = _PRODUCT.sub(r"casadi_product_\2_\3_\5(\1, \4, \6)", text)
     blocks = _split_definitions("\n\n".join([*(_write_product(*map(int, size)) for size in sizes), calls]))
 
-    # Functions at work reuse the arrays of those that have ended; inverses and roots get faster bodies.
+    # Let functions reuse the work arrays of functions that have ended, and give inverses and roots faster bodies.
     blocks, doubles = _compact_work_arrays(blocks, functions)
     for number, function in enumerate(_order_functions(functions)):
         name = f"casadi_f{number}"
         if (body := _write_body(function, blocks[name])) is not None:
             blocks[name] = blocks[name].split("{", 1)[0] + body
 
-    # What is used remains, as C99 that compilers do not warn of, with our prefix.
+    # Keep what is used, and turn it into C99 without warnings, with our prefix.
     names = [function.name() for function in functions]
     code = "\n\n".join(_silence_warnings(blocks[name]) for name in _find_needed(blocks, names))
     code = re.sub(r"\bcasadi_inf\b", "INFINITY", re.sub(r"\bcasadi_nan\b", "NAN", code))
-    # Clang warns of numbers that C would convert to truth values: compare them with zero.
+    # Clang warns if numbers serve as truth values, so they are compared with zero.
     value = r"\(?(\*?\w+(?:\+\+|\[\w+\])?)\)?"
     code = re.sub(rf"\({value}\?", r"((\1 != 0)?", code)
     code = re.sub(rf"\(! ?{value} ?\)", r"(\1 == 0)", code)
     code = re.sub(rf"\({value}(&&|\|\|){value}\)", r"((\1 != 0)\2(\3 != 0))", code)
-    # Types and names of CasADi become those of the library.
+    # Replace types and names of CasADi by those of the library.
     code = re.sub(r"CASADI_CAST\((\w+), ([^()]+)\)", r"(\1)(\2)", code)
     code = re.sub(r"\bcasadi_real\b", "double", re.sub(r"\bcasadi_int\b", "int", code))
     code = re.sub(rf"\b(?:casadi_(?=\w)|(?={'|'.join(names)})(?=\w+\(const double\*\* arg))", f"{prefix}_", code)
     if re.search(r"\bpow\(", code):
-        # `pow` is slow on small processors.
+        # Replace `pow`, which is slow on small processors.
         power = render("algebra.c", {"what": "power", "name": f"{prefix}_power"}).rstrip("\n")
         code = f"{power}\n\n" + re.sub(r"\bpow\(", f"{prefix}_power(", code)
     work = {f.name(): (f.sz_arg(), f.sz_res(), f.sz_iw(), doubles[f.name()]) for f in functions}
@@ -114,7 +126,10 @@ def generate_kernels(functions: list[ca.Function], prefix: str) -> Kernels:
 
 
 def _write_product(rows: int, columns: int, count: int) -> str:
-    """C code for z += x y, with x (rows, columns) and y (columns, count). Four columns at a time save accesses to z."""
+    """C code for z += x y, with x (rows, columns) and y (columns, count).
+
+    It takes four columns of x at a time, because then z is read and written less often.
+    """
     fours = columns - columns % 4
     lines = [
         f"void casadi_product_{rows}_{columns}_{count}(const double* restrict x, const double* restrict y,"
@@ -123,7 +138,7 @@ def _write_product(rows: int, columns: int, count: int) -> str:
         f"  for (i=0; i<{count}; ++i, y+={columns}, z+={rows}) {{",
         "    const double* xk = x;",
     ]
-    # Blocks of four columns, then what is left.
+    # First the blocks of four columns, then the remaining columns.
     for start, stop, step in ((0, fours, 4), (fours, columns, 1)):
         if start < stop:
             terms = " + ".join(f"xk[j+{c * rows}]*y[k+{c}]" for c in range(step))
@@ -136,7 +151,7 @@ def _write_product(rows: int, columns: int, count: int) -> str:
 
 
 def _split_definitions(text: str) -> dict[str, str]:
-    """Functions and constants by name, in order, without the preprocessor lines and comments between them."""
+    """C code of functions and constants by name, in order, without preprocessor lines and comments between them."""
     result: dict[str, str] = {}
     lines = iter(text.splitlines())
     for line in lines:
@@ -145,7 +160,7 @@ def _split_definitions(text: str) -> dict[str, str]:
         if name is None:
             continue
         block = [line]
-        # A function ends with its brace, which is on the first line if the definition is a single one.
+        # A constant ends with a semicolon. A function ends with a brace, on its first line if it is a one-liner.
         while not (block[-1].endswith(";") if data else block[-1] == "}" or line.endswith("}")):
             block.append(next(lines))
         result[name.group(1)] = "\n".join(block)
@@ -156,18 +171,18 @@ def _compact_work_arrays(blocks: dict[str, str], functions: list[ca.Function]) -
     """C code with smaller work arrays, and the number of doubles that each function needs.
 
     Args:
-        blocks: C code by name; called functions are casadi_f0, casadi_f1, ... in the order in which CasADi meets them.
+        blocks: C code by name; called functions are casadi_f0, casadi_f1, ... in the order in which CasADi finds them.
         functions: the functions that the code was generated from, in the same order.
 
     Raises:
-        CompileError: if a new version of CasADi lays the code out in another way.
+        CompileError: if a new version of CasADi writes code of another structure.
     """
-    # The slots of a function begin where those of all that it calls have ended.
+    # A function must not overwrite the arrays of functions that it calls, so its own ones lie behind theirs.
     names = {hash(f): f"casadi_f{number}" for number, f in enumerate(_order_functions(functions))}
     changed = dict(blocks)
     needed: dict[str, int] = {}
 
-    # A function needs what its callees need, and then its own slots.
+    # The number of doubles that a function needs: those of its callees, then its own.
     def need(function: ca.Function) -> int:
         name = names[hash(function)]
         if name not in needed:
@@ -204,12 +219,12 @@ def _find_callees(function: ca.Function) -> list[ca.Function]:
 
 
 def _move_slots(block: str, function: ca.Function, below: int) -> tuple[str, int]:
-    """Code whose slots in the work array begin at `below`, and the end of these slots."""
-    # Slots are declared as *w5=w+17, and no other operation may use the array.
+    """C code of a function whose slots in the work array begin at `below`, and the end of its slots."""
+    # Slots are declared as *w5=w+17. If the code uses the array in another way, it cannot be moved.
     body = _PLACE.sub("", block.split("{", 1)[1])
     if re.search(r"\bw\b", re.sub(rf"{_CALL.pattern}\(arg1, res1, iw, w, 0\)", "", body)):
         return block, function.sz_w()
-    # How many numbers each slot has; a call may have several outputs, each with a slot of its own.
+    # Find the size of each slot. A call may have several outputs, each with a slot of its own.
     sizes: dict[int, int] = {}
     for k in range(function.n_instructions() if function.is_a("MXFunction") else 0):
         node = function.instruction_MX(k)
@@ -219,7 +234,7 @@ def _move_slots(block: str, function: ca.Function, below: int) -> tuple[str, int
                 sizes[slot] = node.which_function().nnz_out(index)
             else:
                 sizes[slot] = (node.get_output(index) if len(slots) > 1 else node).nnz()
-    # Slots must not overlap in CasADi's own layout; then all move by the same shift.
+    # If slots do not overlap in CasADi's layout, all of them can be moved by the same shift.
     places = sorted((int(offset), sizes[int(place)]) for place, offset in _PLACE.findall(block))
     for (offset, size), (following, _) in pairwise(places):
         if offset + size > following:
@@ -231,8 +246,8 @@ def _move_slots(block: str, function: ca.Function, below: int) -> tuple[str, int
 
 
 def _write_body(function: ca.Function, block: str) -> str | None:
-    """The body in C of a function of `orthocas.control.linear_algebra` that is faster than what CasADi writes."""
-    # These functions carry fixed names.
+    """C body of an inverse or root of `orthocas.control.linear_algebra`, faster than CasADi's; None for others."""
+    # Fixed names identify these functions.
     size = function.size1_in(0) if function.n_in() else 0
     if function.name() == LARGE_INVERSE:
         return render("algebra.c", {"what": "inverse", "size": size}).rstrip("\n")
@@ -266,7 +281,7 @@ def _silence_warnings(block: str) -> str:
     if match is None:
         return block
     head, body = block.split("{", 1)
-    # parameters that the body never names
+    # Find the parameters that the body does not use
     parameters = [part.split()[-1].lstrip("*") for part in head[head.index("(") + 1 : head.rindex(")")].split(",")]
     unused = [name for name in parameters if not re.search(rf"\b{name}\b", body)]
     silenced = "".join(f"\n  (void){name};" for name in unused)
@@ -275,14 +290,16 @@ def _silence_warnings(block: str) -> str:
 
 
 def share_calls(functions: list[ca.Function], states: Mapping[str, int]) -> list[ca.Function]:
-    """The graphs after a graph `shared` of (q, dq), which computes what they call several times for these alone.
+    """Move calls that several graphs make with q, or q and dq, into one graph `shared`.
 
     Args:
         functions: graphs whose first inputs are joint positions (n, 1).
-        states: which graphs share, by name: 1 if only their first input is of the state (q, dq), 2 if the second one is
-            dq. They take what `shared` computes as an additional last input.
+        states: the graphs that share calls, by name: 1 if their first input is q, 2 if the second one is dq.
+
+    Returns:
+        The graph `shared` of (q, dq), and the graphs. Those that share take its output as an additional last input.
     """
-    # Open calls until what several graphs call is called by name.
+    # Expand called graphs until the calls that several graphs make are calls of the graphs themselves.
     sharing = {function.name(): function for function in functions if function.name() in states}
     while True:
         called = [result for name, function in sharing.items() for result in _find_calls(function, states[name])]
@@ -294,7 +311,7 @@ def share_calls(functions: list[ca.Function], states: Mapping[str, int]) -> list
             break
         sharing |= changed
 
-    # What they have in common gets a place in `shared`.
+    # Give each common call a place in the output of `shared`.
     common = {hash(function): (function, inputs) for function, inputs in called if hash(function) in several}
     n = functions[0].size1_in(0)
     ends = np.cumsum([0, *(function.numel_out(0) for function, _ in common.values())]).tolist()
@@ -305,7 +322,7 @@ def share_calls(functions: list[ca.Function], states: Mapping[str, int]) -> list
         place = places.get(hash(called)) if _are_first(arguments, given) else None
         return None if place is None else ca.reshape(shared[place], *called.size_out(0))
 
-    # The graphs take it from there.
+    # Replace the calls in the graphs by these places.
     for name, function in sharing.items():
         symbols = function.mx_in()
         with_shared = _replace_calls(function, partial(take_shared, symbols[: states[name]]), [shared])
@@ -316,12 +333,19 @@ def share_calls(functions: list[ca.Function], states: Mapping[str, int]) -> list
 
 
 def _find_calls(function: ca.Function, states: int) -> list[tuple[ca.Function, int]]:
-    """What a graph calls for its first inputs alone, in this order, and for how many; and what that calls for q."""
+    """Functions that a graph calls with only q, or q and dq, each with the number of these inputs.
+
+    Functions that those call with q are included.
+
+    Args:
+        function: the graph.
+        states: number of its first inputs that are q and dq.
+    """
     result: list[tuple[ca.Function, int]] = []
     given = function.mx_in()[:states]
 
     def collect(called: ca.Function, arguments: list[ca.MX]) -> None:
-        # Those of calls of q, in turn, may be shared as well.
+        # Their own calls with q may be shared as well.
         if _are_first(arguments, given):
             result.append((called, len(arguments)))
             result.extend(_find_calls(called, 1))
@@ -336,17 +360,17 @@ def _are_first(arguments: list[ca.MX], given: list[ca.MX]) -> bool:
 
 
 def share_sines(functions: list[ca.Function]) -> list[ca.Function]:
-    """The graphs, in which sines and cosines of joint positions are computed once for all that is called.
+    """Change graphs so that sines and cosines of joint positions are computed once for all called functions.
 
     Args:
         functions: graphs whose first inputs are joint positions (n, 1); others are returned as they are.
     """
-    # One form of each called function, so that its code appears once.
+    # Make one form of each called function, so that its code appears once.
     made: dict[int, ca.Function | None] = {}
     at = ca.SX.sym("q", max((function.size1_in(0) for function in functions), default=0))
     turns = ca.Function("turns", [at], [ca.sin(at), ca.cos(at)])
 
-    # Calls that take q from a graph take its sines and cosines, too.
+    # Calls with q get its sines and cosines as additional inputs.
     def take_given(called: ca.Function, arguments: list[ca.MX]) -> ca.MX | None:
         if called.size1_in(0) != at.shape[0]:
             return None
@@ -355,7 +379,7 @@ def share_sines(functions: list[ca.Function]) -> list[ca.Function]:
         form = made[hash(called)]
         return None if form is None else form(*turns(arguments[0]), *arguments)
 
-    # Open calls until nothing inside calls anything, so that all places are seen.
+    # Expand called graphs until only functions without calls are called, so that every call with q is found.
     def rewrite(function: ca.Function) -> ca.Function:
         within = _replace_calls(function, _open_call)
         return (_replace_calls(function, take_given) or function) if within is None else rewrite(within)
@@ -364,7 +388,7 @@ def share_sines(functions: list[ca.Function]) -> list[ca.Function]:
 
 
 def _open_call(called: ca.Function, arguments: list[ca.MX], but: Collection[int] = ()) -> ca.MX | None:
-    """What a called graph consists of; None for other functions, and for those with the given hashes."""
+    """Output of a called graph, expanded; None for other functions, and for those with hashes in `but`."""
     whole = hash(called) in but or not called.is_a("MXFunction")
     return None if whole else called.call(arguments, True, False)[0]
 
@@ -372,18 +396,18 @@ def _open_call(called: ca.Function, arguments: list[ca.MX], but: Collection[int]
 def _replace_calls(
     function: ca.Function, form: Callable[[ca.Function, list[ca.MX]], ca.MX | None], more: list[ca.MX] | None = None
 ) -> ca.Function | None:
-    """A graph with other expressions for what it calls at its first input; None if there are none.
+    """Replace calls in a graph whose first argument is its first input; None if nothing is replaced.
 
     Args:
         function: the graph.
-        form: the expression for a called function and its arguments; None: it stays.
-        more: symbols that these expressions have, as additional inputs.
+        form: gives an expression for a called function and its arguments, or None to keep the call.
+        more: symbols in these expressions; they become additional inputs.
     """
     if not function.is_a("MXFunction"):
         return None
     inputs = function.mx_in()
     outputs = function.call(inputs, True, False)
-    # Each call of the first input gets its other form; its arguments have their other forms already.
+    # Collect calls and their replacements in order; arguments may contain calls that are replaced already.
     flat, old, new = ca.Function(function.name(), inputs, outputs), list[ca.MX](), list[ca.MX]()
     for k in range(flat.n_instructions()):
         node = flat.instruction_MX(k)
@@ -397,24 +421,27 @@ def _replace_calls(
                 old.append(node.get_output(0))
     if not old:
         return None
-    # Substitution copies what is between.
+    # Substitution copies the expressions between calls, so common ones are merged again.
     outputs = ca.cse(ca.graph_substitute(outputs, old, new))
     inputs, names = inputs + (more or []), function.name_in() + [symbol.name() for symbol in more or []]
     return ca.Function(function.name(), inputs, outputs, names, function.name_out())
 
 
 def _take_sines(function: ca.Function) -> ca.Function | None:
-    """A scalar function of q, ... with one output, as one of sin q, cos q, q, ...; None if it has no sines of q."""
+    """Turn an SX function of (q, ...) into one of (sin q, cos q, q, ...).
+
+    None if it has no sines or cosines of entries of q, or several outputs.
+    """
     if not function.is_a("SXFunction") or function.n_out() != 1:
         return None
     n, inputs = function.size1_in(0), function.sx_in()
     turns = {ca.OP_SIN: ca.SX.sym("sine", n), ca.OP_COS: ca.SX.sym("cosine", n)}
     work: dict[int, ca.SX] = {}
-    # Which joint a place of the work array holds.
+    # The joint whose position a place of the work array holds, for places that hold one.
     joints: dict[int, int] = {}
     entries: dict[int, ca.SX] = {}
     has_turns = False
-    # Run through the instructions, with symbols in place of sines and cosines of entries of q.
+    # Evaluate the instructions with symbols instead of sines and cosines of entries of q.
     for k in range(function.n_instructions()):
         code = function.instruction_id(k)
         into, of = function.instruction_output(k), function.instruction_input(k)
@@ -438,18 +465,22 @@ def _take_sines(function: ca.Function) -> ca.Function | None:
 
 
 def render(template: str, values: Mapping[str, Any], package: str = __package__) -> str:
-    """The text of `templates/TEMPLATE.jinja` of a package. A name that the values lack is an error."""
+    """Fill in `templates/TEMPLATE.jinja` of a package. It is an error if `values` lacks a name in it."""
     return _environment(package).get_template(f"{template}.jinja").render(values)
 
 
 def get_source(name: str, package: str = __package__) -> str:
-    """A C file of a package's `runtime/` as it is."""
+    """Content of a C file in the folder `runtime/` of a package."""
     return (files(package) / "runtime" / name).read_text()
 
 
 @cache
 def _environment(package: str) -> Environment:
-    """Blocks vanish with their lines; `x | numbers` are literals of C, `x | array` and `x | strings` initialisers."""
+    """The Jinja environment of a package's templates.
+
+    Filters: `x | numbers` writes C literals, `x | array` and `x | strings` C initialisers, and `x | code` translates
+    Python for NumPy to the template's library.
+    """
     from jinja2 import Environment, PackageLoader, StrictUndefined, pass_context  # charts load without it
 
     # Missing names are errors, and generated text is not HTML.
@@ -462,9 +493,10 @@ def _environment(package: str) -> Environment:
         autoescape=False,
     )
     environment.filters |= {"numbers": write_numbers, "array": lambda values: f"{{{write_numbers(values)}}}"}
-    environment.filters["strings"] = lambda words: f"{{{', '.join(map(_quote, words))}}}"
+    # C string literals have single quotes in place of double ones.
+    environment.filters["strings"] = lambda words: "{" + ", ".join('"' + w.replace('"', "'") + '"' for w in words) + "}"
 
-    # Python for NumPy as that of the template's library.
+    # Translate Python code for NumPy to the library that the template is for.
     def translate(context: Context, text: str) -> str:
         return str(context["library"].translate(text))
 
@@ -472,16 +504,11 @@ def _environment(package: str) -> Environment:
     return environment
 
 
-def _quote(word: str) -> str:
-    """A string of C; a quote in it would end it."""
-    return '"' + word.replace('"', "'") + '"'
-
-
 def write_numbers(values: Iterable[Any]) -> str:
-    """C literals, with commas between, that convert back to exactly the same numbers; 0 and 1 for truth values."""
+    """C literals separated by commas, which C reads as exactly the same numbers; 0 and 1 for truth values."""
     return ", ".join(map(write_number, np.ravel(np.asarray(values)).tolist()))
 
 
 def write_number(value: float) -> str:
-    """A C literal; whole numbers stay whole."""
+    """A C literal, with a decimal point or exponent only for floats."""
     return str(int(value)) if isinstance(value, int) else _INFINITIES.get(value, repr(float(value)))

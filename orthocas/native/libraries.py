@@ -1,4 +1,4 @@
-"""Shared libraries of C sources: compiled for this process or an earlier one, kept by their content, and loaded."""
+"""Shared libraries from C sources: compiled once, stored under a digest of their sources, and loaded."""
 
 import ctypes
 import hashlib
@@ -22,55 +22,51 @@ _INCLUDED = re.compile(r'^#include "(\w+\.c)"', re.MULTILINE)
 
 
 def keep_library(kind: str, sources: Mapping[str, str], flags: Sequence[str], folder: str | Path | None = None) -> Path:
-    """The shared library of C sources, compiled now or earlier: its name is a digest of sources, compiler and flags.
+    """Path of the shared library of C sources. It is compiled unless there is one from an earlier call.
+
+    Its name contains a digest of sources, compiler and flags.
 
     Args:
-        kind: begins the name of the library.
+        kind: first part of the library's name.
         sources: contents of the files by name.
-        flags: of the compiler.
-        folder: where libraries are kept; default `orthocas/libraries` in $XDG_CACHE_HOME or ~/.cache.
+        flags: flags of the compiler.
+        folder: folder of the libraries. Default: `orthocas/libraries` in $XDG_CACHE_HOME or ~/.cache.
 
     Raises:
-        CompileError: if there is no C compiler, or it fails, or there is no folder of the user's own.
+        CompileError: if there is no C compiler, it fails, or the folder is not the user's own.
         InvalidValueError: if the folder cannot be written.
     """
-    compiler, options = _choose_compiler(), ("-std=c99", "-fPIC", "-shared", *flags)
+    # The compiler is one on the PATH, else that of the pip package ziglang.
+    compiler: tuple[str, ...]
+    try:
+        compiler = (find_compilers()[0],)
+    except CompileError:
+        if importlib.util.find_spec("ziglang") is None:
+            raise
+        compiler = (sys.executable, "-m", "ziglang", "cc")
+    options = ("-std=c99", "-fPIC", "-shared", *flags)
     content = [*(text.encode() for text in sources.values()), repr((compiler, options)).encode()]
     name = f"{kind}-{hashlib.sha256(b'/'.join(content)).hexdigest()[:32]}.so"
     place = _find_cache() if folder is None else as_path("folder", folder)
     library = make_folder("folder", place, mode=0o700).resolve() / name
     _require_own(library.parent)
-    # Draft and checksum appear together, so that other processes never see half a library.
+    # Publish library and checksum together, so that other processes never see half a library.
     if not _is_whole(library):
         with open_draft_folder() as place, publish(library.parent) as drafts:
             for file, text in sources.items():
                 (place / file).write_text(text, encoding="utf-8")
-            # Files that others include are a part of those.
+            # Files that are included by others are not compiled on their own.
             included = {name for text in sources.values() for name in _INCLUDED.findall(text)}
             code = [str(place / file) for file in sources if file.endswith(".c") and file not in included]
             run_program([*compiler, *options, "-o", str(drafts / name), *code, "-lm"])
             if not (drafts / name).is_file():
-                raise CompileError(f"{' '.join(compiler)} wrote no library, expected a compiler of C")
+                raise CompileError(f"{' '.join(compiler)} wrote no library, expected a C compiler")
             (drafts / f"{name}.sha256").write_text(compute_digest(drafts / name))
     return library
 
 
-def _choose_compiler() -> tuple[str, ...]:
-    """The command that compiles C: a compiler on the PATH, or that of the package ziglang, which pip installs anywhere.
-
-    Raises:
-        CompileError: if there is neither.
-    """
-    try:
-        return (find_compilers()[0],)
-    except CompileError:
-        if importlib.util.find_spec("ziglang") is None:
-            raise
-        return (sys.executable, "-m", "ziglang", "cc")
-
-
 def find_compilers() -> tuple[str, ...]:
-    """Compilers: those of gcc and clang that are on the PATH, or cc if neither is.
+    """C compilers on the PATH: gcc and clang, or cc if there is neither.
 
     Raises:
         CompileError: if there is no compiler.
@@ -80,18 +76,18 @@ def find_compilers() -> tuple[str, ...]:
     if not result:
         raise CompileError(
             "no C compiler found, expected gcc, clang or cc on the PATH: apt install gcc, xcode-select --install, or "
-            "pip install ziglang, which suffices for all that is compiled while Python runs"
+            "pip install ziglang, which is enough for C that orthocas compiles for its own use"
         )
     return tuple(result)
 
 
 def _find_cache() -> Path:
-    """Where libraries are kept by default.
+    """Default folder of the libraries.
 
     Raises:
         CompileError: if the user has no home.
     """
-    # Relative paths in XDG_CACHE_HOME do not count, as its specification demands.
+    # Ignore relative paths in XDG_CACHE_HOME, as its specification demands.
     place = Path(os.environ.get("XDG_CACHE_HOME", ""))
     try:
         return (place if place.is_absolute() else Path.home() / ".cache") / "orthocas" / "libraries"
@@ -100,10 +96,10 @@ def _find_cache() -> Path:
 
 
 def load_library(library: Path) -> ctypes.CDLL:
-    """Load a library that was kept.
+    """Load a library of `keep_library`.
 
     Raises:
-        CompileError: if it is damaged or missing, or others could have put it there.
+        CompileError: if it is damaged or missing, or other users could have written it.
     """
     _require_own(library.parent)
     if not _is_whole(library):
@@ -116,12 +112,12 @@ def load_library(library: Path) -> ctypes.CDLL:
 
 
 def _require_own(place: Path) -> None:
-    """Refuse libraries that others could have written: they would run with our rights.
+    """Refuse a folder or file that other users could have written, because its code would run with our rights.
 
     Raises:
-        CompileError: if a folder or file belongs to somebody else but root, or others may write there.
+        CompileError: if it belongs to another user than this one or root, or others may write there.
     """
-    # On Windows, the rights of a folder come from the one above.
+    # On Windows, folders inherit their rights, and there is no such check.
     if not hasattr(os, "geteuid"):
         return
     try:
@@ -135,7 +131,7 @@ def _require_own(place: Path) -> None:
 
 
 def _is_whole(library: Path) -> bool:
-    """Whether a library is complete: the system ends processes that load half of one."""
+    """Whether a library matches its checksum. Loading an incomplete one would kill the process."""
     try:
         return library.with_name(f"{library.name}.sha256").read_text() == compute_digest(library)
     except (OSError, ValueError):
@@ -143,6 +139,6 @@ def _is_whole(library: Path) -> bool:
 
 
 def pointer(array: NDArray[Any]) -> ctypes.c_void_p:
-    """The place of an array, contiguous, that somebody else keeps until the call ends. `data_as` takes microseconds."""
+    """Address of a contiguous array, faster than `data_as`. The caller must keep the array alive during the call."""
     assert array.flags.c_contiguous
     return ctypes.c_void_p(array.__array_interface__["data"][0])

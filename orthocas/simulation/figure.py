@@ -82,9 +82,25 @@ def trajectory_figure(trajectory: "Trajectory", units: Mapping[str, str] | None 
     for axes, label, worst in zip(quantities, trajectory.labels, trajectory.tracking_error, strict=True):
         axes.set_title(f"largest error {worst:.2g} {units.get(label, '')}", loc="right", fontsize=7.5, pad=2)
     quantities[0].legend(fontsize=RULES.font, loc="lower left", bbox_to_anchor=(0, 1), ncols=2, frameon=False)
-    # Right: joints, commands and, for torques, the storage.
-    others = right.subplots(2 + (trajectory.kind == "torque"), 1, sharex=True)
-    _draw_others(others, trajectory, units)
+    # Right: joints and commands. Units depend on whether joints turn, slide, or both.
+    torque = trajectory.kind == "torque"
+    others = right.subplots(2 + torque, 1, sharex=True)
+    unit = " or ".join(sorted({units.get(name, "rad or m") for name in trajectory.joint_names}, reverse=True))
+    force = " or ".join({"rad": "N m", "m": "N"}[part] for part in unit.split(" or "))
+    speed = " or ".join(f"{part}/s" for part in unit.split(" or "))
+    others[0].plot(trajectory.times, trajectory.q, linewidth=1.3, label=trajectory.joint_names)
+    others[0].set_ylabel(f"joints q [{unit}]", fontsize=9)
+    names = len(trajectory.joint_names)
+    others[0].legend(fontsize=7, loc="lower left", bbox_to_anchor=(0, 1), ncols=min(names, 4), frameon=False)
+    others[1].plot(trajectory.times, trajectory.command, linewidth=1.3)
+    others[1].set_ylabel(f"torque [{force}]" if torque else f"velocity [{speed}]", fontsize=9)
+    # For torque controllers, draw the storage below.
+    if torque:
+        storage = np.where(trajectory.fell_back, np.nan, trajectory.storage)
+        others[2].plot(trajectory.times, storage, color=_STORAGE, linewidth=1.3)
+        others[2].set_ylabel("storage V [J]", fontsize=9)
+    for axes in others:
+        _set_style(axes, trajectory)
     for axes in (*quantities, *others):
         shade_fallback(axes, trajectory)
     for axes in (quantities[-1], others[-1]):
@@ -123,27 +139,6 @@ def shade_fallback(axes: Axes, trajectory: "Trajectory") -> None:
         status = ControlStatus(int(trajectory.status[start]))
         if status not in FROM_THE_LAW:
             axes.axvspan(trajectory.times[start], trajectory.times[end], color=FALLBACK, alpha=0.15, linewidth=0)
-
-
-def _draw_others(panels: Array, trajectory: "Trajectory", units: Mapping[str, str]) -> None:
-    """Draw joints, commands and, for torque controllers, the storage."""
-    # The unit depends on whether joints turn, slide, or both.
-    torque = trajectory.kind == "torque"
-    unit = " or ".join(sorted({units.get(name, "rad or m") for name in trajectory.joint_names}, reverse=True))
-    force = " or ".join({"rad": "N m", "m": "N"}[part] for part in unit.split(" or "))
-    speed = " or ".join(f"{part}/s" for part in unit.split(" or "))
-    panels[0].plot(trajectory.times, trajectory.q, linewidth=1.3, label=trajectory.joint_names)
-    panels[0].set_ylabel(f"joints q [{unit}]", fontsize=9)
-    names = len(trajectory.joint_names)
-    panels[0].legend(fontsize=7, loc="lower left", bbox_to_anchor=(0, 1), ncols=min(names, 4), frameon=False)
-    panels[1].plot(trajectory.times, trajectory.command, linewidth=1.3)
-    panels[1].set_ylabel(f"torque [{force}]" if torque else f"velocity [{speed}]", fontsize=9)
-    if torque:
-        storage = np.where(trajectory.fell_back, np.nan, trajectory.storage)
-        panels[2].plot(trajectory.times, storage, color=_STORAGE, linewidth=1.3)
-        panels[2].set_ylabel("storage V [J]", fontsize=9)
-    for axes in panels:
-        _set_style(axes, trajectory)
 
 
 def _set_style(axes: Axes, trajectory: "Trajectory") -> None:

@@ -30,7 +30,7 @@ if TYPE_CHECKING:
 
 _log = logging.getLogger(__name__)
 
-KEPT = 32  #: functions of each kind that a process caches
+KEPT = 96  #: functions that a process caches
 #: (begin, end) [s], start of the reference's segment [s], its parameters, load, state -> states at 25 equally spaced
 #: instants
 Integrator = Callable[[tuple[float, float], float, Array, Array, Array], Array]
@@ -71,7 +71,7 @@ class ClosedLoop:
     @cached_property
     def plant_rate(self) -> ca.Function:
         """state, command (n, 1), load (`Loads.size`, 1) -> rate of the state."""
-        plant = _build_plant(Keyed(self.plant_key, self))
+        plant: ca.Function = build_once(Recipe(("plant", self.plant_key), lambda: self.plant_of_numbers))
         state, command, load, _ = plant.sx_in()
         rate = plant.call([state, command, load, ca.SX(ca.DM(self.plant_numbers))])
         return ca.Function("plant", [state, command, load], rate)
@@ -136,33 +136,34 @@ class ClosedLoop:
 
         The process caches it, so runs that differ only in start, targets or size of loads build it once.
         """
+        profile = reference.profile
+
+        def build() -> ca.Function:
+            state = ca.MX.sym("state", self.size)
+            t, parameters = ca.MX.sym("t"), ca.MX.sym("parameters", profile.size1_in(1))
+            load = ca.MX.sym("load", self.loads.size)
+            command, _ = self.commanded(state, profile.call([t, parameters]))
+            rate = ca.Function("rate", [state, t, parameters, load], [self.plant_rate(state, command, load)])
+            return expand_scalars(rate) if self.controller.function.is_a("SXFunction") else rate
+
         gains = tuple(gain.tobytes() for gain in self.controller.gains.values())
         plant = (self.plant_key, self.plant_numbers.tobytes())
-        return _build_rate(Keyed((self.controller.function, gains, plant), self), reference.profile)
+        rate: ca.Function = build_once(Recipe(("rate", self.controller.function, gains, plant, profile), build))
+        return rate
 
 
 @dataclass(frozen=True)
-class Keyed:
-    """A loop that compares equal to others with the same key."""
+class Recipe:
+    """How to build a function. Recipes with equal keys build equal functions."""
 
     key: Hashable
-    loop: ClosedLoop = field(compare=False)
+    build: Callable[[], Any] = field(compare=False)
 
 
 @lru_cache(KEPT)
-def _build_plant(keyed: Keyed) -> ca.Function:
-    return keyed.loop.plant_of_numbers
-
-
-@lru_cache(KEPT)
-def _build_rate(keyed: Keyed, profile: ca.Function) -> ca.Function:
-    loop = keyed.loop
-    state = ca.MX.sym("state", loop.size)
-    t, parameters = ca.MX.sym("t"), ca.MX.sym("parameters", profile.size1_in(1))
-    load = ca.MX.sym("load", loop.loads.size)
-    command, _ = loop.commanded(state, profile.call([t, parameters]))
-    rate = ca.Function("rate", [state, t, parameters, load], [loop.plant_rate(state, command, load)])
-    return expand_scalars(rate) if loop.controller.function.is_a("SXFunction") else rate
+def build_once(recipe: Recipe) -> Any:
+    """What a recipe builds; the process builds it once, as long as it is cached."""
+    return recipe.build()
 
 
 @dataclass(frozen=True, eq=False)
@@ -193,7 +194,7 @@ def run_compiled(function: ca.Function, *arguments: Any, **named: Any) -> Any:
         try:
             return function(*arguments, **named)
         except RuntimeError as error:
-            raise SimulationError(f"CVODES gave up: {str(error)[:200]}") from None
+            raise SimulationError(f"CVODES failed: {str(error)[:200]}") from None
 
 
 def list_cvodes_options(tolerance: float, stiff: bool) -> dict[str, Any]:
@@ -223,10 +224,14 @@ class CompiledLoop:
     def __init__(self, loop: ClosedLoop, reference: Reference) -> None:
         # CasADi may lose Ctrl-C while it builds functions.
         with deferred(), building:
-            law = loop.controller
-            self._law = _compile_law(law.graph, law.measured, law.energy_graph)
-            self._plant = _compile_plant(Keyed(loop.plant_key, loop))
-            self._profile = _compile_profile(reference.profile)
+            law, profile = loop.controller, reference.profile
+            named = {"command": law.graph, "measured": law.measured, "energy": law.energy_graph}
+            own = {name: function for name, function in named.items() if function is not None}
+            self._law = _compile(("law", *own.items()), lambda: [_rename(*item) for item in own.items()])
+            self._plant = _compile(
+                ("plant in C", loop.plant_key), lambda: [expand_scalars(_rename("plant", loop.plant_of_numbers))]
+            )
+            self._profile = _compile(("profile", profile), lambda: [_rename("profile", profile)])
         self._loop, self._gains = loop, list(loop.controller.gains.values())
 
     def continuous(self, step: float, tolerance: float, outputs: int) -> Callable[..., Array]:
@@ -256,29 +261,12 @@ class CompiledLoop:
         return compiled.Integrator(kernels, sizes, tolerance, step)
 
 
-@lru_cache(KEPT)
-def _compile_law(graph: ca.Function, measured: ca.Function, energy: ca.Function | None) -> Any:
-    """`command`, `measured` and `energy` of a law, compiled."""
-    functions = {"command": graph, "measured": measured, **({} if energy is None else {"energy": energy})}
-    return _compile([_rename(name, function) for name, function in functions.items()])
-
-
-@lru_cache(KEPT)
-def _compile_plant(keyed: Keyed) -> Any:
-    function = keyed.loop.plant_of_numbers
-    return _compile([expand_scalars(_rename(function.name(), function))])
-
-
-@lru_cache(KEPT)
-def _compile_profile(profile: ca.Function) -> Any:
-    return _compile([_rename("profile", profile)])
-
-
-def _compile(functions: Sequence[ca.Function]) -> Any:
+def _compile(key: Hashable, build: Callable[[], list[ca.Function]]) -> Any:
+    """Functions in compiled C; the process compiles them once, as long as they are cached."""
     # Only compiled runs need a code generator and a compiler.
     from orthocas.codegen.compiled import CompiledFunctions
 
-    return CompiledFunctions(functions)
+    return build_once(Recipe(key, lambda: CompiledFunctions(build())))
 
 
 def _rename(name: str, function: ca.Function) -> ca.Function:

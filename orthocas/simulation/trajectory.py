@@ -145,7 +145,7 @@ class Trajectory(Shown):
 
     @property
     def catches(self) -> tuple[tuple[float, ControlStatus], ...]:
-        """Times of catches of a supervised law [s], with reasons; OK: the run started too near the boundary."""
+        """Times of catches of a supervised law [s] and their reasons; OK if the run started too near the boundary."""
         caught = self.status == ControlStatus.CAUGHT
         first = np.flatnonzero(caught & ~np.concatenate([[False], caught[:-1]]))
         return tuple((float(self.times[i]), ControlStatus(int(self.cause[i]))) for i in first)
@@ -235,7 +235,19 @@ class Trajectory(Shown):
             require_known("kind of command", get_part(header, "kind", str), ("torque", "velocity"))
             require_known("outcome", get_part(header, "outcome", str), [outcome.value for outcome in Outcome])
             controller = require_text("controller", get_part(header, "controller", str))
-            checked = _check_arrays(arrays, len(names["joint_names"]), len(names["labels"]))
+            # Arrays have one row per instant, as wide as the kind of quantity.
+            n, k, N = len(names["joint_names"]), len(names["labels"]), arrays["times"].size
+            checked: dict[str, Any] = {}
+            for name, array in arrays.items():
+                checked[name] = as_float_array(name, array)
+                width = () if name in _SINGLE else (n,) if name in _OF_JOINTS else (k,)
+                require_shape(name, checked[name].shape, (N, *width))
+            # Files of early versions have no causes.
+            checked.setdefault("cause", np.zeros(N))
+            for name in ("status", "cause"):
+                checked[name] = freeze_indices(name, checked[name], (N,), len(ControlStatus))
+            if N == 0 or not np.isfinite(checked["times"]).all() or (np.diff(checked["times"]) <= 0).any():
+                raise InvalidValueError("times", "empty or not increasing", "increasing instants, at least one")
             own: dict[str, Any] = {
                 "controller": controller,
                 "kind": header["kind"],
@@ -245,24 +257,6 @@ class Trajectory(Shown):
             return cls(**own, **names, **checked)
         except OrthocasError as error:
             raise TrajectoryFileError(f"{path} is inconsistent: {error}") from None
-
-
-def _check_arrays(arrays: Mapping[str, Any], n: int, k: int) -> dict[str, Any]:
-    """Check the arrays of a run of n joints and k quantities: shapes, and increasing times."""
-    # One row per instant, as wide as the kind of quantity.
-    N = arrays["times"].size
-    checked: dict[str, Any] = {}
-    for name, array in arrays.items():
-        checked[name] = as_float_array(name, array)
-        width = () if name in _SINGLE else (n,) if name in _OF_JOINTS else (k,)
-        require_shape(name, checked[name].shape, (N, *width))
-    # Files of early versions have no causes.
-    checked.setdefault("cause", np.zeros(N))
-    for name in ("status", "cause"):
-        checked[name] = freeze_indices(name, checked[name], (N,), len(ControlStatus))
-    if N == 0 or not np.isfinite(checked["times"]).all() or (np.diff(checked["times"]) <= 0).any():
-        raise InvalidValueError("times", "empty or not increasing", "increasing instants, at least one")
-    return checked
 
 
 assert set(_ARRAYS) < {field.name for field in fields(Trajectory)}

@@ -192,7 +192,7 @@ def test_products_with_basis_gradients_are_those_with_all_entries(
     found = gradients.collect((by_block @ X.transpose(0, 1, 3, 2)).sum(axis=0))
     np.testing.assert_allclose(found, np.einsum("snr,snk->rk", slopes[:300].reshape(300, 3, 2), G), atol=1e-11)
     kept = rng.uniform(size=family.width) < 0.6
-    some = gradients.expand_part(X, 300, kept, 4, np.float32)
+    some = gradients.expand(X, 300, kept, 4, np.float32)
     assert some.dtype == np.float32
     np.testing.assert_allclose(some, G[::4][:, :, kept], rtol=1e-6, atol=1e-6)
     assert gradients.expand(X[:1, :, :, :0], 0).shape == (0, 3, family.width)  # no hinge of a fold acts

@@ -115,7 +115,7 @@ def test_bad_bounds_are_refused(planar_x: oc.Problem, planar_xy: oc.Problem) -> 
             oc.fit(planar_x, oc.Polynomial(1), max_mutual_deg=bound)
     with pytest.raises(InvalidValueError, match="two or more coordinates"):
         oc.fit(planar_xy, oc.Polynomial(1), max_mutual_deg=1.0)
-    with pytest.raises(InvalidValueError, match="given with linear, expected a parametrisation to fit"):
+    with pytest.raises(InvalidValueError, match="given with linear, expected a family with parameters to fit"):
         oc.fit(planar_x, oc.Linear(), max_mutual_deg=1.0)
     with pytest.raises(InvalidValueError, match="linear in its parameters"):
         oc.fit(planar_x, oc.MLP((4,)), max_mutual_deg=1.0)

@@ -385,7 +385,7 @@ def test_bad_settings_are_refused(planar_x: oc.Problem) -> None:
         ({"solvers": []}, "solvers is empty"),
         ({"solvers": [solvers.LBFGS(), solvers.LBFGS(memory=5)]}, "two called 'lbfgs'"),
         ({"weights": [(1.0, 0.5), oc.Weights(1.0, 0.5, 0.0, 0.0, 0.0)]}, "weights is a list with 1,0.5 twice"),
-        ({"solvers": [solvers.LBFGS()], "branch": planar_x.domain}, "wide fits have their own"),
+        ({"solvers": [solvers.LBFGS()], "branch": planar_x.domain}, "wide fits choose their own"),
         ({"clearance": 0.1}, "clearance is given without a branch"),
     ):
         with pytest.raises(InvalidValueError, match=message):

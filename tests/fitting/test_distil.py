@@ -58,11 +58,11 @@ def test_what_is_not_grown_is_refused() -> None:
     fitted = oc.fit(problems.get("planar_3r_x"), oc.Polynomial(2)).chart
     with pytest.raises(InvalidValueError, match="expected a grown chart"):
         oc.distil(fitted)
-    with pytest.raises(InvalidValueError, match="samples is 1, expected enough"):
+    with pytest.raises(InvalidValueError, match="samples is 1, expected more"):
         oc.distil(grown(), oc.Polynomial(6), samples=1)
     with pytest.raises(InvalidValueError, match="bases are fitted by least squares"):
         oc.distil(grown(), oc.Polynomial(2), solver=solvers.LBFGS())
     with pytest.raises(MemoryNeedError):
         oc.distil(grown(), oc.Polynomial(90))
-    with pytest.raises(InvalidValueError, match="a parametrisation that can be fitted"):
+    with pytest.raises(InvalidValueError, match="a family with parameters to fit"):
         oc.distil(grown(), oc.Linear())

@@ -229,7 +229,7 @@ def test_several_quantities_are_coordinates_if_there_are_enough_of_them() -> Non
     assert same.chart.parts.named_coordinates == ("xi1: both 1", "xi2: both 2")
     with pytest.raises(InvalidValueError, match="exact is given with 1 quantity, expected 2 of them"):
         oc.fit_wide(robot, task, box, like="q1", exact=True)
-    with pytest.raises(InvalidValueError, match="like is quantities that the task leaves nothing of"):
+    with pytest.raises(InvalidValueError, match="like is quantities that self-motions cannot change independently"):
         oc.fit_wide(robot, task, box, like=["q1", lambda q: 2 * q[0]], exact=True)
 
 
@@ -250,11 +250,11 @@ def test_what_cannot_be_exact_is_refused() -> None:
         oc.fit_wide(robot, task, BENT, exact=False, parametrisation=given)
     with pytest.raises(ShapeError, match="coordinates 'two'"):
         oc.fit_wide(robot, task, BENT, parametrisation=oc.Given.from_function("two", 3, lambda q: q[:2]))
-    with pytest.raises(InvalidValueError, match="like is quantities that the task leaves nothing of"):
+    with pytest.raises(InvalidValueError, match="like is quantities that self-motions cannot change independently"):
         oc.fit_wide(
             robot, task, BENT, like=lambda q: ca.cos(q[0]) + ca.cos(q[0] + q[1]) + ca.cos(ca.sum1(q)), exact=True
         )
-    with pytest.raises(DomainError, match="in the middle of branch 'box', self-motions do not change a function of q"):
+    with pytest.raises(DomainError, match="at the centre of branch 'box', self-motions do not change a function of q"):
         oc.fit_wide(robot, task, BENT, like=lambda q: q[0] ** 2, exact=True)
 
 

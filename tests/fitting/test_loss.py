@@ -424,7 +424,7 @@ def test_loss_by_arrays_is_the_loss(angles: str, identity: bool, by_arrays: int)
     assert len(loss.volume_terms) == 2
     assert len(loss.array_terms) == by_arrays
     rng = np.random.default_rng(0)
-    data = [rng.normal(size=(N, *symbol.shape)) for symbol in loss.symbols()]
+    data = [rng.normal(size=(N, *symbol.shape)) for symbol in loss.arguments()[1]]
     if not identity:
         place = loss.data.index("metric_inverse")
         data[place] = data[place] @ data[place].transpose(0, 2, 1) + np.eye(sizes.n)

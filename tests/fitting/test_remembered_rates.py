@@ -39,8 +39,7 @@ def test_ends_are_those_of_a_process_that_remembers_nothing(law: PDPlus) -> None
     ]
     remembered = [run(some, **settings) for some, settings in variants]
     for end, (some, settings) in zip(remembered, variants, strict=True):
-        loops._build_rate.cache_clear()
-        loops._build_plant.cache_clear()
+        loops.build_once.cache_clear()
         assert np.array_equal(end, run(some, **settings))
     ends = [end for end, (_, settings) in zip(remembered, variants, strict=True) if "stops" not in settings]
     assert len(np.unique(np.round(ends, 9), axis=0)) == len(ends)
@@ -49,7 +48,7 @@ def test_ends_are_those_of_a_process_that_remembers_nothing(law: PDPlus) -> None
 @pytest.mark.slow
 def test_a_second_run_builds_nothing(law: PDPlus) -> None:
     run(law)
-    before = loops._build_rate.cache_info()
+    before = loops.build_once.cache_info()
     run(law)
-    after = loops._build_rate.cache_info()
+    after = loops.build_once.cache_info()
     assert (after.misses, after.hits) == (before.misses, before.hits + 1)

@@ -409,7 +409,7 @@ def test_the_printed_share_is_of_the_branch(centre: list[float], small: bool) ->
     assert [entry.category for entry in told] == [BranchWarning] * small
     if small:
         assert fit.regular_share < 0.9
-        assert "its middle is not clear, and coordinates have one direction on a part" in str(told[0].message)
+        assert "its centre is not clear, and coordinates have one direction on a part" in str(told[0].message)
         np.testing.assert_array_equal(fit.chart.domain.half_width, box.half_width)
         share = float(re.search(r"all but ([\d.]+)% of the clear", fit.left_out)[1]) / 100  # type: ignore[index]
         assert share == pytest.approx(fit.regular_share, abs=1e-3)
@@ -420,7 +420,7 @@ def test_the_printed_share_is_of_the_branch(centre: list[float], small: bool) ->
         reason = _describe_left_out(smaller, Branch("box", box, box.centre, 1.0, 1.0), q, 0.6)
         inside = np.abs(q - smaller.domain.centre) <= smaller.domain.half_width
         assert reason.startswith(
-            f"all but {percent(float(inside.all(axis=1).mean()))} of the clear positions: its middle"
+            f"all but {percent(float(inside.all(axis=1).mean()))} of the clear positions: its centre"
         )
         assert f"a smaller box, around q = ({number_list(smaller.domain.centre)})" in reason
         for shares, kept in (((0.95,), 0.95), ((0.5, 0.6), 0.6), ((0.6, 0.5), 0.6), ((DomainError("folds"), 0.4), 0.4)):
@@ -438,7 +438,8 @@ def test_branches_say_which_of_them_the_usual_clearance_cannot_serve() -> None:
     assert sum(item.share for item in small) == pytest.approx(0.039, abs=2e-3)
     assert all(f"{item.name} ({item.clearance:.2g} or less)" in found.facts()["too singular"] for item in small)
     # what the error offers is what the table says
-    with pytest.raises(DomainError, match=rf"no position clear by 0.15, .*: at most {small[0].clearance:g} can serve"):
+    most = rf"clearance can be {small[0].clearance:g} at most"
+    with pytest.raises(DomainError, match=f"no position with a relative singular value of 0.15, .*: {most}"):
         oc.fit_wide(robot, task, small[0])
     # its middle is singular, so its home is elsewhere, and the domain keeps nearly all of it
     fit = oc.fit_wide(
@@ -514,7 +515,9 @@ def test_a_tool_that_turns_alone_is_on_one_side_of_singular_positions() -> None:
     whole = oc.Box(domain.centre, domain.half_width)
     problem = oc.Problem(robot, fit.chart.problem.task, domain=whole, least_singular_value=0.1)
     searches = [Search(problem, oc.Polynomial(1), WideSettings(2, seed)) for seed in range(20)]
-    with pytest.raises(InvalidValueError, match="samples is 2, expected more: none lies on the centre's side"):
+    with pytest.raises(
+        InvalidValueError, match="samples is 2, expected more samples: all lie beyond singular positions"
+    ):
         [search.sample(2, 0) for search in searches]
     q = np.vstack([domain.centre, sample_uniform(whole, 4000, 3)])
     moved = geometric_jacobians(robot, q)
@@ -599,7 +602,7 @@ def test_coordinates_have_the_scale_of_the_swivel_by_default() -> None:
 @pytest.mark.slow
 def test_meanings_that_cannot_be_are_refused() -> None:
     task = oc.Task.pose(iiwa())
-    with pytest.raises(InvalidValueError, match="like is quantities that the task leaves nothing of"):
+    with pytest.raises(InvalidValueError, match="like is quantities that self-motions cannot change independently"):
         oc.fit_wide(iiwa(), task, home_branch(), like="A4")  # the elbow bends as the hand is far
     with pytest.raises(UnknownNameError, match="unknown like 'elbow'"):
         oc.fit_wide(iiwa(), task, home_branch(), like="elbow")
@@ -635,7 +638,7 @@ def test_several_coordinates_follow_several_quantities() -> None:
         off.append(np.degrees(np.arccos(np.abs((own * wanted).sum(axis=2)) / lengths)).mean(axis=0))
     assert (off[0] < 25.0).all(), off
     assert (off[0] < off[1] / 2).all(), off
-    with pytest.raises(InvalidValueError, match="like is quantities that the task leaves nothing of"):
+    with pytest.raises(InvalidValueError, match="like is quantities that self-motions cannot change independently"):
         oc.fit_wide(robot, task, box, like=["q3", "q3"], samples=500)
     with pytest.raises(InvalidValueError, match="like is quantities without a finite gradient in the domain"):
         oc.fit_wide(robot, task, box, like=[lambda q: ca.sqrt(q[0])], samples=500)
@@ -1095,7 +1098,7 @@ def test_bad_settings_are_named() -> None:
     with pytest.raises(InvalidValueError, match="clearance"):
         oc.fit_wide(known.robot, known.task, clearance=float("nan"))
     with pytest.raises(
-        InvalidValueError, match=r"parametrisation is linear.*, expected one that is fitted.* or one without"
+        InvalidValueError, match=r"parametrisation is linear.*, expected a family to fit.* or one without"
     ):
         oc.fit_wide(known.robot, known.task, BENT, parametrisation=oc.Linear())
     with pytest.raises(InvalidValueError, match=r"parametrisation is mlp:4x4, expected .* linear in .*, for like"):
@@ -1107,7 +1110,7 @@ def test_bad_settings_are_named() -> None:
 def test_a_middle_with_another_sign_than_the_rest_is_no_domain() -> None:
     robot = oc.Robot.planar(lengths=[1.0, 1.0, 1.0], masses=[3.0, 3.0, 3.0])
     box, task = oc.Box([0.0, 0.35, 0.35], [3.0, 2.9, 2.9]), oc.Task.position(robot, "xy")
-    with pytest.raises(DomainError, match="in the middle of branch 'box', coordinates fold or have another sign"):
+    with pytest.raises(DomainError, match="at the centre of branch 'box', coordinates fold or have another sign"):
         oc.fit_wide(robot, task, box, parametrisation=oc.Polynomial(1), samples=2000)
 
 

@@ -137,7 +137,7 @@ def test_fit_takes_a_robot_and_a_task() -> None:
         robot, oc.Task.position(robot, "xy"), parametrisation=oc.Linear(), metric=problem.metric, domain=problem.domain
     ).chart
     np.testing.assert_array_equal(chart.xi(q), oc.fit(problem, oc.Linear()).chart.xi(q))
-    with pytest.raises(InvalidValueError, match="none beside a problem"):
+    with pytest.raises(InvalidValueError, match="no task or second family"):
         oc.fit(problem, problem.task)
 
 

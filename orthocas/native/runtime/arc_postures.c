@@ -1,13 +1,14 @@
-/* The posture of a task value that is nearest to a start, or farthest from the limits, on the curves of self_motion.c,
- * behind which task_curves.c includes this file. Along each curve and for all full turns of its joints, points are
- * looked at that are close to one another, limits among them. Next to the best of these, the place is found exactly
- * where the value stops to fall, or a limit is met. */
+/* Finds the posture of a task value that is nearest to a start, or farthest from the limits, on the curves of
+ * self_motion.c. task_curves.c includes this file after it. Each curve is sampled densely, for all full turns of its
+ * joints, with crossings of limits among the samples. From the best samples, the exact minimum along the curve is
+ * searched, where the value stops falling or a limit is reached. */
 typedef struct {
   double place, q[N], t[N];
-  int exact; /* or it is on the cubic of a step */
+  int exact; /* whether q lies on the curve; otherwise it lies on the cubic of a step */
 } sample;
 
-/* A point of a curve, after full turns of joints, at which a value has a local minimum among the samples. */
+/* A sample of a curve, moved by `shift` (full turns of joints), at which the value has a local minimum among samples.
+ */
 typedef struct {
   double value, shift[N];
   sample at;
@@ -22,8 +23,8 @@ typedef struct {
   int held;
 } choice;
 
-/* Half the squared distance from the start, without full turns of endless joints, or less the distance from the limits
- * in half-widths; with its slope along t. */
+/* The value to minimise, and its slope along t. With a start: half the squared distance from it, by the shorter way for
+ * joints without limits. Without: minus the distance from the nearest limit, in half-widths. */
 static double value_of_posture(const choice *c, const double *q, const double *t, double *slope) {
   double value = c->start ? 0.0 : -1.0;
   int i;
@@ -52,7 +53,8 @@ static int is_allowed(const double *q) {
   return 1;
 }
 
-/* The exact point of a curve at a place, which goes on beyond the seam of a closed one; 0 where there is none. */
+/* Compute the exact point q of a curve at length `place`, and its tangent t. On closed curves, `place` may lie beyond
+ * the ends. Returns 0 if there is no point. */
 static int stand_at(const choice *c, int curve, double place, double *q, double *t) {
   int p = curve ? c->ends[curve - 1] : 0, i, turns = 0;
   const node *first = c->nodes + p, *last = c->nodes + c->ends[curve] - 1, *at;
@@ -68,7 +70,8 @@ static int stand_at(const choice *c, int curve, double place, double *q, double 
   return 1;
 }
 
-/* Go from a candidate to where its value stops to fall, or to the limit before; 0 if it lies outside. */
+/* Move a candidate along its curve to where its value stops falling, or to a limit before that. Returns 0 if the
+ * candidate lies outside the limits. */
 static int descend(const choice *c, candidate *from) {
   double inside[N], slope_in, slope_out = 0.0, width, value, side;
   int i, round, known = 0;
@@ -81,7 +84,7 @@ static int descend(const choice *c, candidate *from) {
   width = 1.5 * SPACING;
   for (round = 0; round < ROUNDS && width > NARROWED && slope_in < 0.0; ++round) {
     double q[N], t[N], slope, own;
-    /* regula falsi, with every third step a bisection; both ends keep off each other */
+    /* regula falsi, with a bisection in every third round; the new point keeps a distance from both ends */
     const double share = known && round % 3 < 2 ? slope_in / (slope_in - slope_out) : 0.5;
     const double step = fmin(width - NARROWED / 4, fmax(NARROWED / 4, share * width));
     int good = stand_at(c, from->curve, from->at.place + side * step, q, t);
@@ -98,7 +101,7 @@ static int descend(const choice *c, candidate *from) {
       width = step;
       known = good;
       slope_out = good ? side * slope : 0.0;
-      if (good && own < value) { /* as good as the end of the way */
+      if (good && own < value) { /* a smaller value than the best so far */
         memcpy(inside, q, sizeof inside);
         value = own;
       }
@@ -109,7 +112,8 @@ static int descend(const choice *c, candidate *from) {
   return 1;
 }
 
-/* Points of a curve in order, at most SPACING apart, and where it crosses limits, with these exact; their number. */
+/* Sample a curve in order, at most SPACING apart, with its crossings of limits as exact samples. Returns the number of
+ * samples. */
 static int list_samples(const choice *c, int curve, const crossing *crossings, int count, sample *found) {
   int p = curve ? c->ends[curve - 1] : 0, total = 0, k, j;
   double place = 0.0;
@@ -135,14 +139,15 @@ static int list_samples(const choice *c, int curve, const crossing *crossings, i
   return total;
 }
 
-/* Keep the samples of a curve, after some full turns, with a smaller value than both neighbours inside the limits. */
+/* Keep as candidates the samples of a curve, moved by `shift`, that lie inside the limits and have a value no larger
+ * than their neighbours. */
 static void keep_minima(choice *c, int curve, const sample *samples, int count, const double *shift) {
   double before = INFINITY, here = INFINITY, q[N], slope;
   int k, i, j;
   for (k = 0; k <= count; ++k) {
     double next = INFINITY;
     if (k < count) {
-      const double room = samples[k].exact ? -ROUNDED : NEARLY; /* next to limits, a cubic does not tell */
+      const double room = samples[k].exact ? -ROUNDED : NEARLY; /* a point of a cubic is not exact enough near limits */
       for (i = 0; i < N; ++i) {
         q[i] = samples[k].q[i] + shift[i];
         if (!(q[i] >= low[i] + room && q[i] <= high[i] - room)) break;
@@ -163,7 +168,7 @@ static void keep_minima(choice *c, int curve, const sample *samples, int count, 
   }
 }
 
-/* Whether a sampled value may belong to a smaller one than another value: both are at most half a spacing away. */
+/* Whether the minimum near a sampled value may be less than another value. It is at most half a spacing away. */
 static int may_be_less(const choice *c, double value, double than) {
   double slope = 0.0;
   int i;
@@ -173,7 +178,7 @@ static int may_be_less(const choice *c, double value, double than) {
   return value < than + slope * SPACING;
 }
 
-/* The best posture of curves; 1 if there is one. */
+/* Find the best posture q on the curves. Returns 1 if there is one. */
 static int choose_posture(choice *c, int curves, const crossing *crossings, int count, sample *samples, double *q) {
   double best = INFINITY;
   int curve, k, i;
@@ -181,7 +186,7 @@ static int choose_posture(choice *c, int curves, const crossing *crossings, int 
   for (curve = 0; curve < curves; ++curve) {
     const int total = list_samples(c, curve, crossings, count, samples);
     double first[N], last[N], shift[N];
-    /* All full turns after which some point may be within the limits. */
+    /* For every joint, the full turns after which some sample may be within the limits. */
     for (i = 0; i < N; ++i) {
       double least = INFINITY, most = -INFINITY;
       for (k = 0; k < total; ++k) {
@@ -213,8 +218,9 @@ static int choose_posture(choice *c, int curves, const crossing *crossings, int 
   return best < INFINITY;
 }
 
-/* Postures q (rows, N) for targets (rows, size), whose places (rows, width) choose among stored ones (count, N), as
- * choose_starts; `starts` (rows, N) may be NULL. Rows without a posture are NaN. */
+/* Find the best postures q (rows, N) for targets (rows, size). Rows without a posture become NaN. row_places (rows,
+ * width) are the x of the targets, by which choose_starts selects among the stored postures (count, N). `starts` (rows,
+ * N) are the starts of the caller, or NULL for postures farthest from the limits. */
 void choose_rows(int rows, const double *targets, int size, const float *row_places, const double *starts,
                  const double *stored, const float *places, const float *weights, const int *branch, int branches,
                  int width, int count, int patience, node *nodes, crossing *crossings, sample *samples, float *distance,

@@ -1,5 +1,5 @@
-/* What searches along self-motion curves share, for a task with N joints, M components and errors_at: curve_rows.c and
- * self_motion.c include it. */
+/* Functions for searches along self-motion curves, for a task with N joints, M components and the function errors_at.
+ * self_motion.c includes this file. */
 #define TURN 6.283185307179586
 
 static double dot(const double *a, const double *b) {
@@ -13,11 +13,12 @@ static double turned_back(double difference, int joint) {
   return turning[joint] ? difference - TURN * rint(difference / TURN) : difference;
 }
 
-/* The errors e (M) and rates J (M, N), by columns; the largest error, infinite where it is undefined. */
+/* Compute the errors e (M) and their rates J (M, N), by columns. Returns the largest error, or infinity where an error
+ * is undefined. */
 static double task_at(const double *q, const double *target, double *e, double *J) {
   double size = 0.0;
   int i;
-  memset(e, 0, M * sizeof *e); /* compilers do not see that the kernel sets them */
+  memset(e, 0, M * sizeof *e); /* avoids warnings: compilers do not see that the kernel sets them */
   memset(J, 0, M * N * sizeof *J);
   errors_at(q, target, e, J);
   for (i = 0; i < M; ++i) {
@@ -27,7 +28,8 @@ static double task_at(const double *q, const double *target, double *e, double *
   return size;
 }
 
-/* Solve A X = B (n, n + k) in place, X in the columns from n on; the sign of det A, 0 where it is singular. */
+/* Solve A X = B in place, with [A, B] of size (n, n + k): X replaces B. Returns the sign of det A; 0 if A is singular.
+ */
 static int eliminate(double A[N][N + 2], int n, int k) {
   int i, j, c, sign = 1;
   for (c = 0; c < n; ++c) {

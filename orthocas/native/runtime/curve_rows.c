@@ -1,10 +1,11 @@
-/* The nearest xi along self-motion curves, one row after the other: the search of orthocas/charts/curves.py, which says
- * what is done and why, on the curves of native/runtime/self_motion.c. chart_search.c includes both behind the kernels,
- * tables and rules of a chart. */
+/* Finds the point with the nearest xi along self-motion curves, row by row. It is the search of
+ * orthocas/charts/curves.py, which explains the method, on the curves of native/runtime/self_motion.c. chart_search.c
+ * includes both files after the kernels, tables and rules of a chart. */
 #define SHEETS 256
 #define ENDS 64
 
-/* A node of a curve after full turns of its joints: what is left of xi, and where it lies. */
+/* A node of a curve after full turns of its joints: the remaining error `left` of xi, whether it is near the box,
+ * whether it is inside the domain, and whether its step has to be searched closely. */
 typedef struct {
   double q[N], left;
   char near, inside, matters;
@@ -22,7 +23,7 @@ typedef struct {
   looked *room; /* as many as nodes */
 } row_search;
 
-/* xi - xi(q), by the shorter way around. */
+/* The error xi - xi(q), wrapped to half a period. */
 static double xi_left(const double *target, const double *q) {
   const double left = target[M] - xi_at(q);
   return isfinite(PERIOD) ? left - PERIOD * round(left / PERIOD) : left;
@@ -44,7 +45,7 @@ static void take(row_search *row, const double *q, double distance, int between)
   row->between = between;
 }
 
-/* Newton's steps from q to a solution inside. */
+/* Newton's method from `start`; its solution is taken if it lies inside the domain. */
 static void take_solution(row_search *row, const double *start) {
   double q[N], e[M], J[M * N], A[N][N + 2], gradient[N] = {0}, left = 0.0, error;
   int round, i, j, near = 1;
@@ -70,7 +71,8 @@ static void take_solution(row_search *row, const double *start) {
   if (error <= row->tolerance && contains(q)) take(row, q, 0.0, 0);
 }
 
-/* Where the chord from a to b is in the box, or so near: between the shares first and last. Whether it is. */
+/* The part of the chord from a to b, from fraction `first` to `last`, that lies in the box or within `slack` of it.
+ * Returns whether there is such a part. */
 static int shares_inside(const double *a, const double *b, double slack, double *first, double *last) {
   int i;
   *first = 0.0;
@@ -84,7 +86,7 @@ static int shares_inside(const double *a, const double *b, double slack, double 
   return *first < *last;
 }
 
-/* Newton's step from q to the curve across a direction; NaN where there is none. */
+/* One Newton step from q to the curve, perpendicular to the direction `along`. q becomes NaN if there is none. */
 static void correct(double *q, const double *target, const double *along) {
   double e[M], J[M * N], change[N] = {0.0}, t[N];
   int i;
@@ -93,7 +95,7 @@ static void correct(double *q, const double *target, const double *along) {
   for (i = 0; i < N; ++i) q[i] += change[i];
 }
 
-/* Where an arc leaves the domain. */
+/* Find by bisection where an arc leaves the domain, and take that point. */
 static void take_end(row_search *row, const arc_end *end) {
   double a[N], b[N];
   int i, round;
@@ -115,7 +117,8 @@ static void take_end(row_search *row, const arc_end *end) {
   take(row, a, fabs(xi_left(row->target, a)), 0);
 }
 
-/* Keep an end of an arc for later, when most of them are too far; where there is no room, it is looked at now. */
+/* Store an end of an arc for later, when most ends are known to be farther than the best point. If there is no room, it
+ * is evaluated now. */
 static void add_end(row_search *row, const double *inside, const double *outside, double least) {
   arc_end end;
   if (!(least < row->distance)) return;
@@ -126,7 +129,7 @@ static void add_end(row_search *row, const double *inside, const double *outside
   else take_end(row, &end);
 }
 
-/* An arc between a and b, which lie outside: chords that pass the box are halved. */
+/* Search for a short arc in the domain between a and b, which lie outside, by halving chords that pass the box. */
 static void take_short(row_search *row, const double *a, const double *b, int level, double slack) {
   double q[N], along[N], first, last;
   int i;
@@ -141,13 +144,13 @@ static void take_short(row_search *row, const double *a, const double *b, int le
     take(row, q, fabs(xi_left(row->target, q)), 1);
     add_end(row, q, a, 0.0);
     add_end(row, q, b, 0.0);
-  } else if (!in_box(q, 0.0)) { /* conditions are not looked at so closely */
+  } else if (!in_box(q, 0.0)) { /* points in the box that violate other conditions of the domain are not refined */
     take_short(row, a, q, level + 1, slack / 4);
     take_short(row, q, b, level + 1, slack / 4);
   }
 }
 
-/* A point on the cubic of a step after full turns, and the direction there. */
+/* The point q on the cubic of a step, moved by `shift` (full turns), and the direction there. */
 static void point_after(const node *at, const double *shift, double share, double *q, double *along) {
   int i;
   point_on(at, at + 1, share, q, along);
@@ -158,7 +161,7 @@ static int crosses(double a, double b) { return a * b <= 0.0 && !(fabs(b - a) > 
 
 static double share_of(double a, double b) { return a == b ? 0.0 : a / (a - b); }
 
-/* Look closely at a step: roots, points and ends. */
+/* Search a step closely for solutions, for points inside the domain, and for ends of arcs. */
 static void look_closely(row_search *row, const node *at, const double *shift) {
   double q[ROW_PARTS + 1][N], along[N], left[ROW_PARTS + 1], first, last;
   int close[ROW_PARTS + 1], inside[ROW_PARTS + 1], passing, k, i;
@@ -194,7 +197,7 @@ static void look_closely(row_search *row, const node *at, const double *shift) {
     if (inside[k]) take(row, q[k], fabs(left[k]), 1);
 }
 
-/* Look for the target on a curve of some nodes after some full turns. */
+/* Search for the target on a curve of `count` nodes, moved by `shift` (full turns). */
 static void search_sheet(row_search *row, const node *curve, int count, const double *shift) {
   looked *at = row->room;
   double turned = 0.0;
@@ -219,7 +222,7 @@ static void search_sheet(row_search *row, const node *curve, int count, const do
     if (at[p].inside && at[p + 1].inside) {
       ahead = at[p + 1].left - at[p].left;
       if (isfinite(PERIOD)) ahead -= PERIOD * round(ahead / PERIOD);
-      /* xi may turn back where a curve begins, as Newton's method ends at such points. */
+      /* The first and the last step matter too: xi may turn back there, because Newton's method ends at such points. */
       at[p].matters = (char)(crosses(at[p].left, at[p + 1].left) || p == 0 || p + 2 == count ||
                              (at[p - 1].inside && !(ahead * turned > 0)));
       turned = ahead;
@@ -237,8 +240,8 @@ static void search_sheet(row_search *row, const node *curve, int count, const do
   }
 }
 
-/* Look for the target on a curve after all full turns that bring points of it near the box; where there is no room to keep
- * them, at once, and then some more than once. */
+/* Search for the target on a curve, moved by all full turns that bring some of its points near the box. If these are
+ * more than SHEETS, the others are searched at once, some of them more than once. */
 static void search_curve(row_search *row, const node *curve, int points) {
   double sheets[SHEETS + 1][N], lowest_before[N], highest_before[N];
   int count = 0, p, i, s, fresh = 1;
@@ -285,7 +288,7 @@ static void search_curve(row_search *row, const node *curve, int points) {
   for (s = 0; s < count && row->distance > 0.0; ++s) search_sheet(row, curve, points, sheets[s]);
 }
 
-/* Largest distance of a joint from its range, up to full turns. */
+/* The largest distance of a joint from its range, up to full turns. */
 static double away_from_box(const double *q) {
   double away = 0.0;
   int i;
@@ -294,8 +297,8 @@ static double away_from_box(const double *q) {
   return away;
 }
 
-/* Search from some starts (count, N), and add to the curves, `curves` in number, that are traced; returns their number.
- */
+/* Search from starts (count, N), and add new curves to the `curves` ones that are traced already. Returns the number of
+ * curves. */
 static int search_from(row_search *row, const double *starts, int count, node *nodes, int *ends, int curves) {
   double q[STARTS][N], t[STARTS][N], away[STARTS];
   char known[STARTS];
@@ -322,9 +325,9 @@ static int search_from(row_search *row, const double *starts, int count, node *n
   return curves;
 }
 
-/* The nearest points for rows of targets: q, |xi - xi(q)| (infinite where there is none), and whether q is neither a
- * solution nor an end of an arc. Of the starts (rows, count, N), those after the `first` ones serve rows without a
- * solution; count is at most STARTS. `room` has `curve_room()` bytes. */
+/* Find the nearest points for rows of targets: q, |xi - xi(q)| (infinite if there is no point), and `between`, whether
+ * q is neither a solution nor an end of an arc. Of the starts (rows, count, N), those after the first `first` are used
+ * if these give no solution; count is at most STARTS. `room` must have `curve_room()` bytes. */
 void curve_rows(long rows, const double *targets, const double *starts, long first, long count, double tolerance,
                 void *room, double *q, double *distance, char *between) {
   node *nodes = (node *)room;

@@ -1,22 +1,26 @@
-/* The self-motion curves of a task value, r = 1: ways to x, the curves there whatever the limits, and where limits cut
- * them. task_curves.c and chart_motion.c include it behind the kernels, tables and rules of a task, and goes_on, which says
- * whether a curve is followed beyond a point; orthocas.arms.kernel says what is done and why. */
+/* The self-motion curves of a task value x, r = 1: Newton steps to x, the curves of x regardless of joint limits, and
+ * the points where curves cross limits. task_curves.c and chart_motion.c include this file after the kernels, tables
+ * and rules of a task and the function goes_on, which tells whether a curve is followed beyond a point.
+ * orthocas.arms.kernel explains the method. */
 #define M (N - 1)
 
 #include "curve_math.c"
 
-/* A point of a curve, the unit tangent, and the length of the curve to the next point. */
+/* A point q of a curve, its unit tangent t, and the length of the curve from there to the next node. */
 typedef struct {
   double q[N], t[N], length;
 } node;
 
-/* Where a curve meets a limit: q of a joint, less full turns, is its lowest (side 0) or highest (1) position. */
+/* A point where a curve crosses a limit: minus `turns` full turns, the joint is at its lowest (side 0) or highest (side
+ * 1) position there. `place` is the length of the curve up to the point, and `rises` is 1 if the joint position grows.
+ */
 typedef struct {
   double place, q[N];
   int curve, joint, side, turns, rises;
 } crossing;
 
-/* dq with J dq = e, row . dq = rest, and the unit tangent with det [J; t] > 0; 0 where there is none. */
+/* Compute `change` with J change = e and row . change = rest, and the unit tangent t with det [J; t] > 0. Returns 0 if
+ * there is none, else 1. */
 static int bordered(const double *J, const double *e, const double *row, double rest, double *change, double *t) {
   double A[N][N + 2], size = 0.0;
   int i, j, sign;
@@ -40,11 +44,11 @@ static int bordered(const double *J, const double *e, const double *row, double 
   return 1;
 }
 
-/* The unit tangent at a point; 0 where there is none. */
+/* Compute the unit tangent at a point. Returns 0 if there is none, else 1. */
 static int tangent_at(const double *J, double *t) {
   double none[M] = {0.0}, change[N], row[N], ahead;
   int i, k;
-  for (i = 0; i < N; ++i) row[i] = 1.0 + 0.1 * i; /* seldom perpendicular to the tangent */
+  for (i = 0; i < N; ++i) row[i] = 1.0 + 0.1 * i; /* rarely perpendicular to the tangent */
   if (bordered(J, none, row, 0.0, change, t)) {
     ahead = fabs(dot(row, t));
     if (ahead > 0.3) return 1;
@@ -57,11 +61,11 @@ static int tangent_at(const double *J, double *t) {
   return 0;
 }
 
-/* Whether a joint slides without limits: x may be any distance from the stored postures along it. */
+/* Whether a joint slides without limits. Stored postures may be at any distance from x along such a rail. */
 static int is_rail(int joint) { return !turning[joint] && !isfinite(high[joint] - low[joint]); }
 
-/* Damped least squares from q to x, whatever the limits; 1 if it arrives, with the tangent there. Steps are bounded,
- * other than those of rails. */
+/* Move q to x by damped least squares, regardless of limits. Returns 1 if it arrives, with the tangent t there. The
+ * length of steps is bounded, except along rails. */
 static int reach(double *q, const double *target, double *t) {
   int round, i, j, k;
   for (round = 0; round < REACH; ++round) {
@@ -77,7 +81,7 @@ static int reach(double *q, const double *target, double *t) {
       trace += L[i][i];
     }
     damping = (error > 0.1 ? FAR_DAMPING : error > 1e-3 ? NEAR_DAMPING : 1e-14) * trace;
-    for (i = 0; i < M; ++i) { /* Cholesky's factor, and forward substitution */
+    for (i = 0; i < M; ++i) { /* Cholesky factor and forward substitution */
       double sum;
       y[i] = e[i];
       for (j = 0; j < i; ++j) {
@@ -108,7 +112,7 @@ static int reach(double *q, const double *target, double *t) {
   return 0;
 }
 
-/* The cubic curve from a node, less q there, at a share of the way to the next one, and its derivative. */
+/* The cubic from node a to node b, minus a->q, and its derivative by u, for u from 0 to 1. */
 static void on_cubic(const node *a, const node *b, double u, double *q, double *slope) {
   const double h = a->length;
   int i;
@@ -119,9 +123,9 @@ static void on_cubic(const node *a, const node *b, double u, double *q, double *
   }
 }
 
-/* Whether a point q of a curve, with its tangent t, lies on the step from a to b, up to full turns. Curves that pass each
- * other near a singular position run in opposite directions there. Between surely and hardly, the point of the step
- * beside q decides: it is q, or not. */
+/* Whether a point q of a curve, with tangent t, lies on the step from a to b, up to full turns. Two curves that pass
+ * each other near a singular position run in opposite directions there, so tangents tell them apart. If the distance
+ * from the cubic leaves it open, the nearest exact point of the step decides: it must be q. */
 static int on_step(const node *a, const node *b, const double *q, const double *t, const double *target) {
   double away[N], at[N], slope[N], e[M], J[M * N], change[N], onward[N], square = 0.0, u, gap, size;
   const double near = fmin(KNOWN, RESOLVED * a->length), most = (a->length + near) * (a->length + near);
@@ -159,7 +163,7 @@ static int on_step(const node *a, const node *b, const double *q, const double *
   return dot(change, change) < 0.01 * gap * gap;
 }
 
-/* The number of the curve, of some, that q lies on; -1 for none. */
+/* The index of the curve that q lies on; -1 if it lies on none. */
 static int find_curve(const node *nodes, const int *ends, int curves, const double *q, const double *t,
                       const double *target) {
   int c, p = 0;
@@ -169,7 +173,8 @@ static int find_curve(const node *nodes, const int *ends, int curves, const doub
   return -1;
 }
 
-/* The length of a step with unit tangents at both ends: of a cubic whose slopes have the length of an arc. */
+/* The length of the step from a to b: that of a cubic whose end slopes have the length of an arc with these tangents.
+ */
 static double length_of(const node *a, const node *b) {
   static const double u[3] = {0.1127016653792583, 0.5, 0.8872983346207417}, w[3] = {5.0 / 18, 8.0 / 18, 5.0 / 18};
   double square = 0.0, h, length = 0.0;
@@ -188,8 +193,9 @@ static double length_of(const node *a, const node *b) {
   return length;
 }
 
-/* Follow the curve from nodes[0] along its tangent, or against it. Returns the number of nodes; *closed is 1 if the last
- * is the first, up to full turns. Against the tangent, the nodes have it reversed. */
+/* Follow the curve from nodes[0] along its tangent (sense 1) or against it (sense -1). Returns the number of nodes.
+ * *closed is set to 1 if the last node is the first one, up to full turns. With sense -1, the tangents of nodes are
+ * reversed. */
 static int follow(node *nodes, int most, const double *target, double sense, int *closed) {
   double h = STEP / 3, h_before = 0.0;
   int count = 1, i, round;
@@ -200,7 +206,7 @@ static int follow(node *nodes, int most, const double *target, double sense, int
     node *next = nodes + count;
     double e[M], J[M * N], change[N], t[N], missed = 0.0, size = 0.0, turned = 0.0;
     int good = 0;
-    if (h_before > 0.0) { /* the cubic of the last step, continued */
+    if (h_before > 0.0) { /* predict by the cubic of the last step */
       on_cubic(at - 1, at, 1.0 + h / h_before, next->q, change);
       for (i = 0; i < N; ++i) next->q[i] += at[-1].q[i];
     } else {
@@ -228,11 +234,11 @@ static int follow(node *nodes, int most, const double *target, double sense, int
     }
     nodes[count - 1].length = length_of(at, next);
     if (count > 2 && on_step(at, next, nodes[0].q, nodes[0].t, target)) {
-      if (h > SHORTEST * 2 && !(dot(at->t, nodes[0].t) > TURNED)) { /* the first point lies in a bend */
+      if (h > SHORTEST * 2 && !(dot(at->t, nodes[0].t) > TURNED)) { /* a bend: take a shorter step */
         h /= 2;
         continue;
       }
-      for (i = 0; i < N; ++i) /* the last node is the first */
+      for (i = 0; i < N; ++i) /* make the last node equal to the first one */
         next->q[i] = nodes[0].q[i] + (turning[i] ? TURN * rint((next->q[i] - nodes[0].q[i]) / TURN) : 0.0);
       memcpy(next->t, nodes[0].t, sizeof next->t);
       nodes[count - 1].length = length_of(at, next);
@@ -251,7 +257,7 @@ static int follow(node *nodes, int most, const double *target, double sense, int
   return count;
 }
 
-/* The nodes of a curve in the opposite order; tangents keep their sense. */
+/* Reverse the order of the nodes of a curve. Tangents are not reversed. */
 static void turn_around(node *nodes, int count) {
   int p;
   for (p = 0; p < count / 2; ++p) {
@@ -262,14 +268,14 @@ static void turn_around(node *nodes, int count) {
   for (p = 0; p + 1 < count; ++p) nodes[p].length = nodes[p + 1].length;
 }
 
-/* The curve through q from end to end; the number of its nodes. */
+/* Trace the curve through q from end to end. Returns the number of its nodes. */
 static int trace(node *nodes, int most, const double *q, const double *t, const double *target, int *closed) {
   int count, behind, p, i;
   memcpy(nodes[0].q, q, sizeof nodes[0].q);
   memcpy(nodes[0].t, t, sizeof nodes[0].t);
   count = follow(nodes, most, target, 1.0, closed);
   if (*closed || count == most) return count;
-  /* It has two ends: the part behind comes first. */
+  /* The curve has two ends: put the part behind q first. */
   turn_around(nodes, count);
   memcpy(nodes[count - 1].t, t, sizeof nodes[0].t);
   behind = follow(nodes + count - 1, most - count + 1, target, -1.0, closed);
@@ -281,7 +287,7 @@ static int trace(node *nodes, int most, const double *q, const double *t, const 
   return count;
 }
 
-/* The least singular value of J, and its right singular vector v, by inverse iteration. */
+/* Return the least singular value of J, and compute its right singular vector v, by inverse iteration. */
 static double weakest(const double *J, double *v) {
   double L[M][M], y[M], size = 0.0;
   int i, j, k, round;
@@ -316,7 +322,8 @@ static double weakest(const double *J, double *v) {
   return size;
 }
 
-/* Starts beyond the singular positions next to a curve, where another one may run beside it; their number. */
+/* Add starts across singular positions near a curve, because another curve may run on their other side. Returns the
+ * number of starts. */
 static int add_bridges(const double *target, const node *nodes, int count, double *bridges) {
   int p, k, side, added = 0;
   for (p = 0; p < BRIDGES; ++p) {
@@ -329,8 +336,9 @@ static int add_bridges(const double *target, const node *nodes, int count, doubl
   return added;
 }
 
-/* All curves of x that `starts` (count, N) lead to. ends[c] is the number of nodes up to the end of curve c. Starts end
- * after `patience` of them in turn found no new curve. Returns the number of curves. */
+/* Find all curves of x that `starts` (count, N) lead to. Returns their number. ends[c] is set to the number of nodes up
+ * to the end of curve c, and *used to the number of starts used. The search ends after `patience` consecutive starts
+ * without a new curve. */
 int find_curves(const double *target, const double *starts, int count, int patience, node *nodes, int most, int *ends,
                 int *closed, int *used) {
   double bridges[2 * BRIDGES * CURVES * N];
@@ -356,7 +364,8 @@ int find_curves(const double *target, const double *starts, int count, int patie
   return curves;
 }
 
-/* The exact point near q at which a joint has a value, with its tangent; 1 if it is near. */
+/* Move q along the curve to the exact point where a joint has a given value; t is set to the tangent. Returns 1 if that
+ * point is near. */
 static int meet_limit(const double *target, double *q, double *t, int joint, double value) {
   double start[N], e[M], J[M * N], change[N], row[N] = {0.0}, gap = 0.0, size = 0.0;
   int round, i;
@@ -373,7 +382,8 @@ static int meet_limit(const double *target, double *q, double *t, int joint, dou
   return size < 1e-6 && gap < MISSED * MISSED;
 }
 
-/* The exact point of the curve across t, with its tangent. */
+/* Move q to the exact point of the curve in the plane perpendicular to t, and set t to the tangent. Returns 1 on
+ * success. / */
 static int meet_curve(const double *target, double *q, double *t) {
   double e[M], J[M * N], change[N], row[N], size;
   int round, i;
@@ -388,14 +398,14 @@ static int meet_curve(const double *target, double *q, double *t) {
   return dot(row, t) > 0.0;
 }
 
-/* One component of a cubic step: from 0 to d with slopes h a and h b, in powers of u. */
+/* Coefficients of u, u^2, u^3 of one component of a cubic step, which begins at 0. */
 typedef struct {
   double one, two, three;
 } cubic;
 
 static double value_of(const cubic *c, double u) { return u * (c->one + u * (c->two + u * c->three)); }
 
-/* The shares of a step at which a component turns, their number. */
+/* The u, between 0 and 1 in order, at which the derivative of a component changes its sign. Returns their number. */
 static int turns_of(const cubic *c, double *u) {
   const double a = 3 * c->three, b = 2 * c->two, square = b * b - 4 * a * c->one;
   double root, first, second;
@@ -420,7 +430,8 @@ typedef struct {
   int curve, count, most;
 } search;
 
-/* The cubic of a joint on a step, the shares at which it turns, 0 before and 1 after them; the number of pieces. */
+/* Compute the cubic of a joint on a step, and the u that divide the step into monotone pieces: 0, those at which the
+ * joint turns back, and 1. Returns the number of pieces. */
 static int pieces_of(const node *a, const node *b, int joint, cubic *c, double bends[4]) {
   const double h = a->length, d = b->q[joint] - a->q[joint];
   int pieces;
@@ -433,7 +444,7 @@ static int pieces_of(const node *a, const node *b, int joint, cubic *c, double b
   return pieces;
 }
 
-/* The point on the cubic of a step, and its unit tangent. */
+/* The point q on the cubic of a step at u, and the unit tangent t there. */
 static void point_on(const node *a, const node *b, double u, double *q, double *t) {
   double size;
   int k;
@@ -445,7 +456,7 @@ static void point_on(const node *a, const node *b, double u, double *q, double *
   }
 }
 
-/* The share of a step at which a joint turns next to a limit; -1 where none does. */
+/* The u of a step at which a joint turns back within `graze` of a limit; -1 if none does. */
 static double find_graze(const node *a, const node *b, double graze) {
   int i, j, side;
   for (i = 0; i < N; ++i) {
@@ -461,7 +472,7 @@ static double find_graze(const node *a, const node *b, double graze) {
   return -1.0;
 }
 
-/* Add where a joint, on a piece of a step, has a value v beyond its value at the begin. */
+/* Add the crossing at which a joint, on a monotone piece of a step, has moved by v from its value at node a, if any. */
 static void cross(search *s, const node *a, const node *b, const cubic *c, const double *piece, double v, crossing kind) {
   double left = piece[0], right = piece[1], t[N], before, whole;
   node exact;
@@ -476,7 +487,7 @@ static void cross(search *s, const node *a, const node *b, const cubic *c, const
   }
   *at = kind;
   point_on(a, b, left, at->q, t);
-  if (!meet_limit(s->target, at->q, t, kind.joint, a->q[kind.joint] + v)) { /* the joint turns back there */
+  if (!meet_limit(s->target, at->q, t, kind.joint, a->q[kind.joint] + v)) { /* the joint turns back before the limit */
     point_on(a, b, left, at->q, t);
     meet_curve(s->target, at->q, t);
   }
@@ -489,8 +500,8 @@ static void cross(search *s, const node *a, const node *b, const cubic *c, const
   ++s->count;
 }
 
-/* The crossings of a step that begins at `place` of a curve. Where a joint turns back next to a limit, the step is
- * divided there by an exact point of the curve. */
+/* Add the crossings of a step that begins at length `place` of a curve. If a joint turns back close to a limit, an
+ * exact point of the curve divides the step there. */
 static void cross_step(search *s, const node *a, const node *b, double place, int depth) {
   const double share = depth < HALVINGS ? find_graze(a, b, GRAZE / (1 << (4 * depth))) : -1.0;
   int i, j, side, turns;
@@ -532,7 +543,7 @@ static void cross_step(search *s, const node *a, const node *b, double place, in
   }
 }
 
-/* Where curves cross limits; the number of crossings, those of a step in any order. */
+/* Find where curves cross limits. Returns the number of crossings. Those of one step are in any order. */
 int find_crossings(const double *target, const node *nodes, const int *ends, int curves, crossing *found, int most) {
   search s = {target, found, 0, 0, most};
   int p = 0;
@@ -548,16 +559,16 @@ int find_crossings(const double *target, const node *nodes, const int *ends, int
 
 unsigned long crossing_size(void) { return sizeof(crossing); }
 
-/* Points q (count, N) brought to the curve across directions t (count, N), which become its tangents; good[k] is 0 where
- * that fails. */
+/* Move points q (count, N) to the curve, perpendicular to directions t (count, N), which become its tangents. good[k]
+ * is set to 0 where that fails, else to 1. */
 void correct_rows(const double *target, int count, double *q, double *t, char *good) {
   int k;
   for (k = 0; k < count; ++k) good[k] = (char)meet_curve(target, q + N * k, t + N * k);
 }
 
-/* For each branch, the stored postures nearest in x: their numbers in turn of branches go to `chosen`, their number is
- * returned. `places` (size, count) are of the postures, in the order of branches, that of branch k begins at
- * branch[k]; distances count `weights`. */
+/* Choose for each branch the stored postures whose x is nearest to `place` (size). Their indices go to `chosen`, one of
+ * each branch in turn, and their number is returned. `places` (size, count) has the x of the postures, ordered by
+ * branch; those of branch k begin at branch[k]. Squared distances are multiplied by `weights` (count). */
 int choose_starts(const float *places, const float *weights, const int *branch, int branches, int size, int count,
                   const float *place, int most, float *distance, int *chosen) {
   int i, k, s, each = (most + branches - 1) / branches, total = 0;
@@ -567,7 +578,7 @@ int choose_starts(const float *places, const float *weights, const int *branch, 
     for (s = 0; s < count; ++s) distance[s] += (row[s] - at) * (row[s] - at);
   }
   for (s = 0; s < count; ++s) distance[s] *= weights[s];
-  for (k = 0; k < branches; ++k) { /* a sorted list of the best, each at its place in turn */
+  for (k = 0; k < branches; ++k) { /* insert postures into the sorted list of the branch */
     int held = 0;
     for (s = branch[k]; s < branch[k + 1]; ++s) {
       int at;
