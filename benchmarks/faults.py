@@ -5,7 +5,7 @@ runs 5 times, from random postures in the inner half of the domain:
 
 - Sensors stand still: those of an arm that moves (its joints follow sines that begin at 0.2 rad/s), of one on its way
   back, of one at rest whose reference then moves at 2 cm/s, and of one with masses 20 % off and integral action. The
-  fastest joint within 200 ms counts.
+  fastest joint within 200 ms counts. Then those of a single joint of an arm that moves, and all speeds, which stay at 0.
 - Blows: the last joint turns at 32 to 60 times its limit.
 - References: targets of 1e6, jumps to random postures, 5 a second along all quantities, such velocities without a
   motion, and streams at 50 Hz of random postures and of targets around 1e6, one in ten NaN. The fastest joint counts,
@@ -47,8 +47,8 @@ OBSERVED = 12, 13, 14  # bits of encoders
 TRAVEL = 0.05  # of a sliding joint in a turn of its encoder [m]
 PUSH = 50.0, 500, 600  # [N], from and to a tick
 HEADER = (
-    "| chart | sensors stand still [rad/s] | blow, at once and 1.5 s later [rad/s] | references [speed limit] "
-    "| caught with 0 to 5 ms: at rest after, back | brakes open [rad/s] |\n| --- | --- | --- | --- | --- | --- |"
+    "| chart | sensors stand still [rad/s] | of one joint; speeds [rad/s] | blow, at once and 1.5 s later [rad/s] | references [speed limit] "
+    "| caught with 0 to 5 ms: at rest after, back | brakes open [rad/s] |\n| --- | --- | --- | --- | --- | --- | --- |"
 )
 OBSERVED_HEADER = (
     "| chart | bits | torque at its rate limit [% of ticks] | change a tick, rms [N m] | flange off [mm] "
@@ -127,7 +127,7 @@ def main(quick: bool = False) -> dict[str, int]:
     arms, runs = (ARMS[:1], 1) if quick else (ARMS, RUNS)
     faults = table(HEADER, rows(arms, runs))
     observed = table(OBSERVED_HEADER, observed_rows(arms, runs))
-    each = len(STANDING) + 1 + len(ASKED) + len(DELAYS) + 1
+    each = len(STANDING) + len(FREEZING) + 1 + len(ASKED) + len(DELAYS) + 1
     found = {"faults": runs * each * len(faults), "observed": 4 * runs * len(observed)}
     found["runs"] = sum(found.values())
     print(found)
@@ -157,13 +157,15 @@ def rows(arms: tuple[str, ...], runs: int) -> Iterator[str]:
 
 def row(arm: Arm, label: str, runs: int) -> str:
     """The worst of all runs of each case."""
-    frozen = [max(stands_still(arm, case)[0] for _ in range(runs)) for case in STANDING]
+    still = [max(stands_still(arm, case)[0] for _ in range(runs)) for case in STANDING]
+    frozen = [max(stands_still(arm, case)[0] for _ in range(runs)) for case in FREEZING]
     blown = np.array([blow(arm) for _ in range(runs)]).max(axis=0)
     asked = [max(led(arm, case) for _ in range(runs)) for case in ASKED]
     held = np.array([caught(arm, delay) for delay in DELAYS for _ in range(runs)])
     opened = max(brakes(arm) for _ in range(runs))
     return (
-        f"| {label} | {', '.join(f'{speed:.1f}' for speed in frozen)} | {blown[0]:.0f}, {blown[1]:.2f} "
+        f"| {label} | {', '.join(f'{speed:.1f}' for speed in still)} "
+        f"| {', '.join(f'{speed:.1f}' for speed in frozen)} | {blown[0]:.0f}, {blown[1]:.2f} "
         f"| {', '.join(f'{share:.2f}' for share in asked)} | {held[:, 0].max():.2f} s, "
         f"{int(held[:, 1].sum())} of {len(held)} | {opened:.3f} |"
     )
@@ -251,6 +253,7 @@ def moves(arm: Arm, scale: float = 1.0, delay: int = 0, push: float = 0.0) -> Mo
 DELAYS = 0, 1, 3, 5  # [ms]
 WATCHED, BACK = 2.5, 0.5  # of a caught arm, until it is asked back and then [s]
 STANDING = ("moving", "way back", "reference", "integral")
+FREEZING = ("one joint", "speeds")
 
 
 def stands_still(arm: Arm, case: str) -> tuple[float, float]:
@@ -270,11 +273,17 @@ def stands_still(arm: Arm, case: str) -> tuple[float, float]:
     reference, signs, most = arm.resting(q), arm.rng.choice([-1.0, 1.0], arm.chart.n), np.zeros(arm.chart.n)
     # Integral action takes longer to come to rest.
     settled = 5 * SETTLED if wrong else SETTLED
+    froze = np.arange(arm.chart.n) == (arm.rng.integers(arm.chart.n) if case == "one joint" else -1)
     for k in range(settled + round(LOOK / TICK)):
         if k <= settled:
             q_seen, dq_seen = arm.seen(plant)
-            seen = q_seen, dq_seen if case == "moving" else (k < settled) * dq_seen
-        if case == "moving":
+            seen = q_seen, dq_seen if case in ("moving", *FREEZING) else (k < settled) * dq_seen
+        elif case == "one joint":
+            now = arm.seen(plant)
+            seen = tuple(np.where(froze, *pair) for pair in zip(seen, now, strict=True))
+        elif case == "speeds":
+            seen = arm.seen(plant)[0], 0 * dq_seen
+        if case in ("moving", *FREEZING):
             angle = 2 * k * TICK
             reference = motion(arm.chart, q + 0.1 * signs * (1 - np.cos(angle)), 0.2 * signs * np.sin(angle))
         if k == settled and case == "way back":
