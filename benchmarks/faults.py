@@ -5,7 +5,8 @@ runs 5 times, from random postures in the inner half of the domain:
 
 - Sensors stand still: those of an arm that moves (its joints follow sines that begin at 0.2 rad/s), of one on its way
   back, of one at rest whose reference then moves at 2 cm/s, and of one with masses 20 % off and integral action. The
-  fastest joint within 200 ms counts. Then those of a single joint of an arm that moves, and all speeds, which stay at 0.
+  fastest joint within 200 ms counts. Then those of a single joint of an arm that moves, and all speeds, which stay at
+  0.
 - Blows: the last joint turns at 32 to 60 times its limit.
 - References: targets of 1e6, jumps to random postures, 5 a second along all quantities, such velocities without a
   motion, and streams at 50 Hz of random postures and of targets around 1e6, one in ten NaN. The fastest joint counts,
@@ -47,7 +48,8 @@ OBSERVED = 12, 13, 14  # bits of encoders
 TRAVEL = 0.05  # of a sliding joint in a turn of its encoder [m]
 PUSH = 50.0, 500, 600  # [N], from and to a tick
 HEADER = (
-    "| chart | sensors stand still [rad/s] | of one joint; speeds [rad/s] | blow, at once and 1.5 s later [rad/s] | references [speed limit] "
+    "| chart | sensors stand still [rad/s] | of one joint; speeds [rad/s] "
+    "| blow, at once and 1.5 s later [rad/s] | references [speed limit] "
     "| caught with 0 to 5 ms: at rest after, back | brakes open [rad/s] |\n| --- | --- | --- | --- | --- | --- | --- |"
 )
 OBSERVED_HEADER = (
