@@ -306,17 +306,20 @@ class SelfMotions(Shown):
         row, owners = int(np.argmax(values)), np.repeat(np.arange(len(counts)), counts)
         k = int(owners[row])
         arc, at, step = self.components[k], float(np.concatenate(places)[row]), self.components[k].length / counts[k]
-        # Refine the best place by golden-section search on its arc.
-        low, high = max(0.0, at - 2 * step), min(arc.length, at + 2 * step)
+        # Refine the best place by golden-section search on its arc, across the seam of a closed one.
+        low, high = at - 2 * step, at + 2 * step
+        if not arc.closed:
+            low, high = max(0.0, low), min(arc.length, high)
         best = Place(q[row], float(values[row]), k, at)
         ratio = (np.sqrt(5) - 1) / 2
         for _ in range(RULES.golden):
             pair = np.array([high - ratio * (high - low), low + ratio * (high - low)])
-            tried = arc.at(pair)
+            along = pair % arc.length if arc.closed else pair
+            tried = arc.at(along)
             first, second = evaluate(tried)
             j = 0 if first >= second else 1
             if (first, second)[j] > best.value:
-                best = Place(tried[j], float((first, second)[j]), k, float(pair[j]))
+                best = Place(tried[j], float((first, second)[j]), k, float(along[j]))
             low, high = (low, pair[1]) if j == 0 else (pair[0], high)
             if high - low < RULES.refined:
                 break

@@ -9,7 +9,7 @@ import casadi as ca
 import numpy as np
 from numpy.typing import ArrayLike
 
-from orthocas.errors import InvalidValueError
+from orthocas.errors import InvalidValueError, units_hint
 from orthocas.robots.spatial import constant, skew, turn
 from orthocas.robots.tree import KinematicTree
 from orthocas.tools.checks import Array, as_float_array, require_finite
@@ -313,7 +313,8 @@ def check_payload(value: ArrayLike) -> Array:
             about that centre, in axes of the tip frame: Ixx, Ixy, Ixz, Iyy, Iyz, Izz [kg m^2].
 
     Raises:
-        InvalidValueError: for another shape, a negative mass, or an inertia that is not positive semidefinite.
+        InvalidValueError: for another shape, a negative mass, a centre that looks like millimetres, or an inertia that
+            is not positive semidefinite.
     """
     values = np.atleast_1d(as_float_array("payload", value))
     if values.shape not in ((1,), (4,), (PAYLOAD,)):
@@ -324,6 +325,8 @@ def check_payload(value: ArrayLike) -> Array:
     numbers[: len(values)] = values
     if numbers[0] < 0:
         raise InvalidValueError("mass of payload", numbers[0], "a mass >= 0")
+    if hint := units_hint(("m", "m", "m"), numbers[1:4].tolist()):
+        raise InvalidValueError("centre of payload", numbers[1:4].tolist(), f"a position in the tip frame{hint}")
     inertia = numbers[4:][_MATRIX].reshape(3, 3)
     smallest = float(np.linalg.eigvalsh(inertia)[0])
     if smallest < -_INDEFINITE * np.abs(inertia).max():

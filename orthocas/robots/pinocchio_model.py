@@ -16,6 +16,7 @@ from orthocas.tools.checks import Array, freeze_array, require_known
 _log = logging.getLogger(__name__)
 
 LINKS = (pin.FrameType.BODY, pin.FrameType.OP_FRAME)  #: frames of links in URDF, of bodies and sites in MJCF
+_ROUNDED = 1e-6  #: [rad] or [m], by which a locked joint may be beyond its limits: files round 170 degrees
 _UNLIMITED = 1e10  #: limits above this count as infinite: Pinocchio uses the largest double
 _GRIPPER = re.compile("gripper|finger|jaw", re.IGNORECASE)
 _FINGER = re.compile("finger|jaw", re.IGNORECASE)
@@ -232,7 +233,7 @@ def lock_joints(model: pin.Model, locked: Mapping[str, float], mimics: Mimics | 
 
     Raises:
         UnknownNameError: if there is no such joint.
-        InvalidValueError: if a position is not finite, or an angle looks like degrees.
+        InvalidValueError: if a position is not finite, is beyond the limits of its joint, or looks like degrees.
         RobotError: if the joint mimics another one, or has several degrees of freedom and a position other than 0.
     """
     if not isinstance(locked, Mapping):
@@ -249,6 +250,13 @@ def lock_joints(model: pin.Model, locked: Mapping[str, float], mimics: Mimics | 
             raise InvalidValueError(f"locked position of joint '{name}'", repr(value), "a finite number")
         ids.append(model.getJointId(name))
         set_position(model, ids[-1], float(value), position)
+        # A continuous joint has no limits, and equal limits are a placeholder.
+        joint = model.joints[ids[-1]]
+        if joint.nq == joint.nv == 1:
+            lower, upper = model.lowerPositionLimit[joint.idx_q], model.upperPositionLimit[joint.idx_q]
+            if lower < upper and not lower - _ROUNDED <= value <= upper + _ROUNDED:
+                limits = f"a position within its limits [{lower:g}, {upper:g}]"
+                raise InvalidValueError(f"locked position of joint '{name}'", f"{value:g}", limits)
     ids += [i for i in model.mimicking_joints if find_leader(model, i) in ids]
     for name, mimic in (mimics or {}).items():
         if mimic.leader in locked and name in names:

@@ -268,6 +268,17 @@ def test_best_posture_is_better_than_dense_samples() -> None:
         motions.best(lambda q: q)
 
 
+@pytest.mark.parametrize("short", [-0.02, -0.005, 0.005, 0.02])
+def test_best_posture_of_a_closed_arc_may_lie_on_both_sides_of_its_seam(short: float) -> None:
+    motions = planar().self_motion([2.5, 0.0])
+    (arc,) = motions
+    assert arc.closed
+    wish = arc.at(short % arc.length)
+    found = motions.best(lambda q: -np.linalg.norm(motions.measure_away(q, wish), axis=1))
+    assert found.value > -1e-6
+    np.testing.assert_allclose(arc.at(found.place), found.q, atol=1e-9)
+
+
 def lies_on(curve: Curve, q: Array, tangent: Array) -> bool:
     """Whether a posture (n,) lies on a curve, up to full turns: near points of it at most 0.02 rad apart."""
     parts = (curve.q[:-1], curve.q[1:], curve.tangent[:-1], curve.tangent[1:], curve.length[:-1, None])

@@ -81,6 +81,7 @@ def test_a_mass_is_a_point_at_the_tip() -> None:
         (-1.0, "mass of payload is -1"),
         ([1.0, 0.0], "shape of payload"),
         ([1.0, 0, 0, np.nan], "payload"),
+        ([1.0, 0, 0, 80.0], r"centre of payload is \[0.0, 0.0, 80.0\].*are these millimetres"),
         ([1.0, 0, 0, 0, 1, 0, 0, 1, 0, -1], "smallest principal inertia of payload"),
         ("heavy", "payload"),
     ],

@@ -9,7 +9,7 @@ import pytest
 from conftest import ROBOTS, arm, pinocchio_position, robot_data
 
 import orthocas as oc
-from orthocas.errors import RobotError
+from orthocas.errors import InvalidValueError, RobotError
 from orthocas.problems import iiwa_robot
 from orthocas.robots import pinocchio_model, urdf
 
@@ -243,6 +243,16 @@ def test_locked_joint_on_the_way_to_the_tip_stays_where_it_is() -> None:
     q[[free.joint_names.index(name) for name in ("torso_lift_joint", "arm_4_joint")]] = 0.2, 1.0
     rest = q[[name in locked.joint_names for name in free.joint_names]]
     np.testing.assert_allclose(locked.tip_position(rest), free.tip_position(q), atol=1e-12)
+
+
+def test_a_joint_is_locked_within_its_limits_only() -> None:
+    """The file of panda says [-3.0718, -0.0698] for joint 4; its rounded last digits are no error."""
+    path = robot_data("panda_description/urdf/panda.urdf")
+    for value in (-3.0718, -0.0698, -0.0698 + 1e-7):
+        assert oc.Robot.from_urdf(path, "panda_hand", {"panda_joint4": value}).n == 6
+    for joint, value in (("panda_joint4", 0.5), ("panda_joint4", 0.0), ("panda_finger_joint1", 20.0)):
+        with pytest.raises(InvalidValueError, match=rf"'{joint}' is {value:g}, expected a position within its limits"):
+            oc.Robot.from_urdf(path, "panda_hand", {joint: value})
 
 
 def test_floating_base_of_a_file_is_held_where_the_file_puts_it(
