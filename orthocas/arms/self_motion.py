@@ -10,6 +10,8 @@ from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike
+from scipy.ndimage import minimum_filter
+from scipy.optimize import minimize
 
 from orthocas.arms.kernel import Curve, build_curvature, evaluate_cubic
 from orthocas.arms.maps import ArmMaps
@@ -344,20 +346,36 @@ class SelfMotions(Shown):
         first, second = self.components[a], self.components[b]
         spaced = [np.linspace(0.0, arc.length, max(2, int(arc.length / RULES.spacing) + 2)) for arc in (first, second)]
         rows = [arc.at(places) for arc, places in zip((first, second), spaced, strict=True)]
-        apart = [np.linalg.norm(self.measure_away(rows[1], q), axis=1) for q in rows[0]]
-        i, j = np.unravel_index(int(np.argmin(apart)), (len(rows[0]), len(rows[1])))
-        # Start from the nearest pair of points, and project onto the two arcs in turn.
-        near, at = rows[0][i], (float(spaced[0][i]), float(spaced[1][j]))
-        best, value = None, np.inf
-        for _ in range(MERGE.pairs):
-            other = self._refine(b, at[1], near)
-            own = self._refine(a, at[0], other.q)
-            near, at = own.q, (own.place, other.place)
-            if best is not None and own.value > value * (1 - MERGE.settled):
-                break
-            best, value = (own, other), own.value
-        assert best is not None
-        return Gap(value, *best)
+        apart = np.array([np.linalg.norm(self.measure_away(rows[1], q), axis=1) for q in rows[0]])
+
+        def halve_square(places: Array) -> tuple[float, Array]:
+            """Half the squared distance of the postures at two places, and its gradient (2,)."""
+            (q,), (t,) = first._stand(_turn_back(first, places[:1]))
+            (other,), (u,) = second._stand(_turn_back(second, places[1:]))
+            away = self.measure_away(other[None], q)[0]
+            return 0.5 * float(away @ away), np.array([-away @ t, away @ u])
+
+        # Descend along both arcs at once from the pairs of points that are nearer than those around them.
+        bounds = [(None, None) if arc.closed else (0.0, arc.length) for arc in (first, second)]
+        cells = np.argwhere(apart <= minimum_filter(apart, size=3))
+        cells = cells[np.argsort(apart[tuple(cells.T)])][: RULES.candidates]
+        ends = [
+            minimize(
+                halve_square,
+                [spaced[0][i], spaced[1][j]],
+                jac=True,
+                method="L-BFGS-B",
+                bounds=bounds,
+                options={"ftol": 0.0, "gtol": RULES.refined},
+            )
+            for i, j in cells
+        ]
+        x, y = min(ends, key=lambda end: float(end.fun)).x
+        place, goal = (float(_turn_back(arc, np.array([at]))[0]) for arc, at in ((first, x), (second, y)))
+        q, other = first.at(place), second.at(goal)
+        other = q + self.measure_away(other[None], q)[0]
+        value = float(np.linalg.norm(other - q))
+        return Gap(value, Place(q, value, a, place), Place(other, value, b, goal))
 
     def merge(self, a: int, b: int) -> Merge:
         """A way from one component to another on which x deviates little.
@@ -505,6 +523,11 @@ class SelfMotions(Shown):
             if abs(step) < RULES.refined:
                 break
         return best
+
+
+def _turn_back(arc: Arc, places: Array) -> Array:
+    """Places (P,) on an arc, also of those beyond the ends of a closed one."""
+    return places % arc.length if arc.closed else places
 
 
 def find_motions(maps: ArmMaps, target: Array, *starts: Array) -> SelfMotions:

@@ -339,6 +339,19 @@ def test_out_of_reach_there_is_no_arc() -> None:
         motions.nearest([0.0, 0.0, 0.0])
 
 
+def test_a_gap_between_nearly_parallel_arcs_is_perpendicular_to_both() -> None:
+    """Where neither posture is an end: by differences along the arcs."""
+    arm = oc.Arm(oc.Task.pose(oc.problems.get("iiwa").robot))
+    motions = arm.self_motion(arm.x([-1.569, -0.755, 1.78, 0.03, 0.038, -1.105, -2.966]))
+    gap, step = motions.gap(2, 0), 1e-4
+    away = motions.measure_away(gap.second.q[None], gap.first.q)[0]
+    for posture in (gap.first, gap.second):
+        arc = motions.components[posture.component]
+        assert step < posture.place < arc.length - step
+        along = (arc.at(posture.place + step) - arc.at(posture.place - step)) / (2 * step)
+        assert abs(away @ along) < 1e-5 * gap.value
+
+
 def test_gap_and_merge_of_a_planar_arm_are_those_of_its_linkage() -> None:
     """With the tip at a distance r of the base, links of 1 m make a four-bar linkage of sides 1, 1, 1, r.
 
