@@ -98,7 +98,7 @@ class Gap(NamedTuple):
 class Merge(NamedTuple):
     """A way from one component to another, with the least deviation from x that was found."""
 
-    value: float  #: largest error of x on the way, straight between postures [rad], or as far as a radian moves x
+    value: float  #: largest error of x, at 16 places from each posture to the next [rad], or as far as a radian moves x
     q: Array  #: posture with the largest error (n,); for its value of x, the components meet, or a limit separates them
     x: Array  #: value of x at `q`, (m,)
     way: Array  #: postures (P, n) from one component to the other
