@@ -621,9 +621,9 @@ static int plausible(const orthocas_arm *arm, const orthocas_state *state, const
   int agree = 1, odd = faster_than(arm, dq, safety->speed_limit, rules.implausible);
   for (int i = 0; i < arm->n; ++i) {
     const double far = rules.implausible * safety->speed_limit[i] * lasted(state->bad_ticks, period) + rules.jitter;
-    const double told = 0.5 * (dq[i] + state->seen_dq[i]) * state->unseen, slack = rules.jitter + rules.alike * fabs(told);
+    const double told = 0.5 * (dq[i] + state->seen_dq[i]) * state->unseen, room = rules.jitter + rules.alike * fabs(told);
     odd = odd || (recent && fabs(between(arm, i, unturned(arm, state, i, q[i]) - state->q[i])) > far);
-    agree = agree && fabs(between(arm, i, q[i] - state->seen_q[i]) - told) <= slack;
+    agree = agree && fabs(between(arm, i, q[i] - state->seen_q[i]) - told) <= room;
   }
   return !odd || agree;
 }
@@ -654,7 +654,7 @@ static void carry(const orthocas_arm *arm, orthocas_state *state, const double *
 
 /* R8: sensors stand still if they repeat the last measurement, bit by bit, though the arm moves, must have moved by what
  * was commanded, or (R36) was not slow and cannot have stopped since. Arms at rest may repeat it for ever. */
-static int frozen(const orthocas_arm *arm, const orthocas_state *state, const double *dq, double period, double *work) {
+static int stuck(const orthocas_arm *arm, const orthocas_state *state, const double *dq, double period, double *work) {
   const orthocas_safety *safety = state->safety;
   const double time = lasted(state->same_ticks - state->bad_ticks, period);
   double *speed = take(&work, arm->n);
@@ -726,7 +726,7 @@ static int look(const orthocas_arm *arm, orthocas_state *state, const double *q,
   copy(state->seen_q, q, n);
   copy(state->seen_dq, dq, n);
   state->unseen = 0.0;
-  if (!frozen(arm, state, dq, period, work)) return good;
+  if (!stuck(arm, state, dq, period, work)) return good;
   if (!measures_speeds(arm, state)) return 0;
   if (state->bad_ticks == 0 && !faster_than(arm, dq, state->safety->rest_speed, rules.stirring))
     copy(state->dq, state->carried, n);
@@ -787,7 +787,7 @@ static int gives_way(const orthocas_state *state) {
 }
 
 /* R35: whether joints are faster than limits, or on the way there: they accelerate on, half as much on average, until
- * the torque that drives them is taken back at command_rate. What a wall or the rebound of a blow balances drives none. */
+ * the torque that drives them is taken back at command_rate. What a wall or a rebound balances drives none. */
 static int hurries(const orthocas_arm *arm, orthocas_state *state, double period) {
   const orthocas_safety *safety = state->safety;
   const double *dq = state->dq, rate = fmin(rules.trend, 1.0 / period);
