@@ -35,9 +35,9 @@ class ArcRules:
     """Settings of searches on arcs. Lengths are in [rad] or [m]."""
 
     parts: int = 4  #: points on each step that are searched for the nearest
-    candidates: int = 3  #: largest number of these points that are refined
+    candidates: int = 3  #: largest number of these points, or of pairs of them, that are refined
     refinements: int = 12  #: largest number of refinements of a place
-    refined: float = 1e-10  #: change of a place that ends its refinement
+    refined: float = 1e-10  #: change of a place, or slope of half a squared gap, that ends its refinement
     largest: float = 0.2  #: largest change of a place, and least distance between candidates
     least_slope: float = 0.1  #: least secant slope of the derivative of half the squared distance along an arc
     most: int = 1_000_000  #: largest number of postures of a sample
@@ -60,7 +60,7 @@ class MergeRules:
     step: float = 0.3  #: fraction of a Gauss-Newton step towards x, across the way, that a posture takes
     longest: float = 0.05  #: largest length of these steps [rad] or [m]
     damping: float = 1e-2  #: damping of these steps, relative to the trace of J J^T
-    pairs: int = 40  #: largest number of rounds of the searches for a gap and for a pass
+    pairs: int = 40  #: largest number of rounds of the search for a pass
     near: float = 0.2  #: largest relative difference between the errors of a pass and of the worst posture of the way
     away: float = 1.0  #: largest distance between these two [rad] or [m]
     flat: float = 1e-4  #: curvature, relative to the largest, below which it counts as none
